@@ -114,15 +114,16 @@ def pose(params: BallbotParams, x: np.ndarray) -> Pose:
     return Pose(ball, body, body + params.body_length / 2 * axis, turn)
 
 
-def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray] | None]]:
-    """Colour, and start and end (3,), m, or None where there is none to draw, of the arrows of a robot's force and push.
+def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
+    """Colour, and start and end (3,), m, of the arrows of a robot's force and push, where there is one to draw.
 
     The force's starts at the ball's centre, and the push's at the body's centre of mass, as of `pose`.
     """
     drawn = ((FORCE, robot.u, FORCE_SCALE, LEAST_FORCE, place.ball), (PUSH, robot.push, PUSH_SCALE, 0.0, place.body))
     return [
-        (color, None if part is None or math.hypot(*part) <= least else (at, at + scale * np.array([*part, 0.0])))
+        (color, (at, at + scale * np.array([*part, 0.0])))
         for color, part, scale, least, at in drawn
+        if part is not None and math.hypot(*part) > least
     ]
 
 

@@ -181,11 +181,9 @@ def _robot(params: BallbotParams, robot: Robot) -> list[_Solid]:
 def _arrows(params: BallbotParams, robot: Robot) -> list[_Solid]:
     """Those of a robot's force and push."""
     solids = []
-    for color, ends in arrows(pose(params, robot.x), robot):
-        if ends is not None:
-            start, end = ends
-            neck = end - min(_HEAD_LENGTH / float(np.linalg.norm(end - start)), 0.9) * (end - start)
-            solids += [(_placed(_CYLINDER, start, neck, _ARROW), color), (_placed(_CONE, neck, end, _HEAD), color)]
+    for color, (start, end) in arrows(pose(params, robot.x), robot):
+        neck = end - min(_HEAD_LENGTH / float(np.linalg.norm(end - start)), 0.9) * (end - start)
+        solids += [(_placed(_CYLINDER, start, neck, _ARROW), color), (_placed(_CONE, neck, end, _HEAD), color)]
     return solids
 
 

@@ -11,7 +11,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
@@ -22,7 +22,6 @@ from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, a
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import rgb
-from ballbot_gym.tasks.marker import Marker
 
 PORT = 8080
 _EYE, _AIM = (-2.6, -1.8, 1.5), (0.0, 0.0, 0.5)  # m: from behind a robot that moves along x
@@ -81,15 +80,19 @@ class Viewer:
         self.trace: list[np.ndarray] = []
         """Points (2,) at which `show` has shown the robot since they were emptied, m."""
         self._next = 0.0
-        self._shown: dict[str, tuple[Hashable, list[Any]]] = {}
-        self._before: dict[str, tuple[Hashable, list[Any]]] = {}
+        self._looks: object = None
+        self._parts: list[list[Any]] = []
         self._shift = np.zeros(2)
         scene = self.server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(cast_shadow=False)  # shadows of light are slow without a graphics card
         scene.world_axes.visible = False
         self.server.initial_camera.position, self.server.initial_camera.look_at = _EYE, _AIM
-        self._world = scene.add_frame("/world", show_axes=False)
+        self._world, self._bodies = (scene.add_frame(name, show_axes=False) for name in ("/world", "/world/bodies"))
+        self._lines = scene.add_line_segments("/world/lines", *_segments(()), thickness=0.015)
+        self._arrows = {
+            color: scene.add_arrows(f"/world/{color}", _segments(())[0], rgb(color)) for color in (FORCE, PUSH)
+        }
         scene.add_grid(
             "/world/floor",
             infinite_grid=True,
@@ -108,17 +111,22 @@ class Viewer:
 
     def draw(self, drawing: Drawing) -> None:
         """Shows a moment. What is the same as before is not sent again."""
+        params, robots = drawing.params, drawing.robots[::-1]
+        looks = params, drawing.posts, [(robot.color, robot.alpha) for robot in robots]
         with self.server.atomic():
             self._follow(drawing.centre)
-            self._before, self._shown = self._shown, {}
-            for i, robot in enumerate(reversed(drawing.robots)):
-                self._draw_robot(i, drawing.params, robot)
-            for i, path in enumerate(drawing.lines):
-                self._draw_line(f"line{i}", path)
-            for i, marker in enumerate(drawing.posts):
-                self._draw_post(f"post{i}", marker)
-            for _, nodes in self._before.values():
-                nodes[0].remove()
+            if looks != self._looks:
+                self._looks, self._parts = looks, self._add_bodies(drawing)
+            for i, (robot, (ball, body, _, label)) in enumerate(zip(robots, self._parts, strict=True)):
+                place = pose(params, robot.x)
+                ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
+                label.text, label.visible = robot.label, robot.label != ""
+                label.position = place.top + (0.0, 0.0, _LABEL_HEIGHT * (i + 1))
+            shown = [arrow for robot in robots for arrow in arrows(pose(params, robot.x), robot)]
+            for color, node in self._arrows.items():
+                ends = [ends for own, ends in shown if own == color]
+                node.points = np.array(ends, np.float32).reshape(-1, 2, 3)
+            self._lines.points, self._lines.colors = _segments(drawing.lines)
 
     def show(self, drawing: Drawing, seconds: float) -> None:
         """Shows a drawing of one robot, and its `trace`, when so much time has passed since the last one, s."""
@@ -135,38 +143,27 @@ class Viewer:
 
     def _follow(self, goal: np.ndarray) -> None:
         """Moves the scene so that a point of the floor (2,), m, comes to the middle."""
-        at_once = not self._shown or np.hypot(*(goal - self._shift)) > _JUMP
+        at_once = self._looks is None or np.hypot(*(goal - self._shift)) > _JUMP
         self._shift = self._shift + (1.0 if at_once else _FOLLOW) * (goal - self._shift)
         self._world.position = (-self._shift[0], -self._shift[1], 0.0)
 
-    def _nodes(self, key: str, look: Hashable, make: Callable[[str], list[Any]]) -> list[Any]:
-        """viser's nodes of what is drawn under a key, made anew if it looks otherwise. The first one holds the others."""
-        known = self._before.pop(key, None)
-        if known is None or known[0] != look:
-            if known is not None:
-                known[1][0].remove()
-            known = look, make(f"/world/{key}")
-        self._shown[key] = known
-        return known[1]
+    def _add_bodies(self, drawing: Drawing) -> list[list[Any]]:
+        """Adds posts and robots in place of those before. Nodes of each robot, the last one first, which can be dragged."""
+        scene, name = self.server.scene, "/world/bodies"
+        self._bodies.remove()
+        self._bodies = scene.add_frame(name, show_axes=False)
+        for i, post in enumerate(drawing.posts):
+            look = {"position": (*post.position, post.height / 2), "opacity": _opacity(post.color[3])}
+            scene.add_cylinder(f"{name}/post{i}", post.radius, post.height, rgb(post.color), **look)
+        robots = enumerate(drawing.robots[::-1])
+        parts = [self._add_robot(f"{name}/robot{i}", drawing.params, robot) for i, robot in robots]
+        for part in parts[0][:3] if parts else ():
+            part.on_drag("left")(self._grabbed)
+        return parts
 
-    def _draw_robot(self, i: int, params: BallbotParams, robot: Robot) -> None:
-        """Moves a robot, its arrows and its label. The first one can be dragged."""
-        look = params, robot.color, robot.alpha
-        nodes = self._nodes(f"robot{i}", look, lambda name: self._add_robot(name, params, robot, grab=i == 0))
-        _, ball, body, force, push, label = nodes
-        place = pose(params, robot.x)
-        ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
-        for node, (_, ends) in zip((force, push), arrows(place, robot), strict=True):
-            node.visible = ends is not None
-            if ends is not None:
-                node.points = np.array([ends], np.float32)
-        label.text, label.visible = robot.label, robot.label != ""
-        label.position = place.top + (0.0, 0.0, _LABEL_HEIGHT * (i + 1))
-
-    def _add_robot(self, name: str, params: BallbotParams, robot: Robot, grab: bool) -> list[Any]:
+    def _add_robot(self, name: str, params: BallbotParams, robot: Robot) -> list[Any]:
         scene, radius, length = self.server.scene, params.body_radius, params.body_length
-        look = {"opacity": None if robot.alpha == 1 else robot.alpha, "cast_shadow": False, "receive_shadow": False}
-        root = scene.add_frame(name, show_axes=False)
+        look = {"opacity": _opacity(robot.alpha), "cast_shadow": False, "receive_shadow": False}
         ball = scene.add_icosphere(f"{name}/ball", params.ball_radius, rgb(BALL), **look)
         body = scene.add_cylinder(f"{name}/body", radius, length, rgb(robot.color), **look)
         place = (0.0, 0.0, 0.44 * length)
@@ -179,27 +176,7 @@ class Viewer:
             position=(0.0, 0.0, _SHADOW_HEIGHT - params.ball_radius),
             **look | {"opacity": _SHADOW * robot.alpha},
         )
-        for part in (ball, body, cap) if grab else ():
-            part.on_drag("left")(self._grabbed)
-        force, push = (
-            scene.add_arrows(f"{name}/{what}", np.zeros((1, 2, 3)), rgb(color), visible=False)
-            for what, color in (("force", FORCE), ("push", PUSH))
-        )
-        label = scene.add_label(f"{name}/label", "", anchor="bottom-center", visible=False)
-        return [root, ball, body, force, push, label]
-
-    def _draw_line(self, key: str, path: GroundPath) -> None:
-        add, segments, width = self.server.scene.add_line_segments, _segments(path), 0.02 if path.dashed else 0.015
-        look = path.color, path.dashed
-        (node,) = self._nodes(key, look, lambda name: [add(name, segments, rgb(path.color), thickness=width)])
-        node.points = segments
-
-    def _draw_post(self, key: str, marker: Marker) -> None:
-        """Draws a marker, which does not move."""
-        (x, y), color, opacity = marker.position, rgb(marker.color), marker.color[3]
-        add, look = self.server.scene.add_cylinder, {"opacity": None if opacity == 1 else opacity}
-        place = (x, y, marker.height / 2)
-        self._nodes(key, marker, lambda name: [add(name, marker.radius, marker.height, color, position=place, **look)])
+        return [ball, body, cap, scene.add_label(f"{name}/label", "", anchor="bottom-center", visible=False)]
 
     async def _grabbed(self, event: Any) -> None:
         """A coroutine, so that viser keeps the order of the events."""
@@ -257,14 +234,21 @@ def _refusal(headers: Any) -> str:
     return ""
 
 
-def _segments(path: GroundPath) -> np.ndarray:
-    """(n, 2, 3) the line segments of a path, at most `_MOST_SEGMENTS`."""
-    points = path.points
-    if len(points) > _MOST_SEGMENTS:
-        points = points[np.linspace(0, len(points) - 1, _MOST_SEGMENTS + 1).round().astype(int)]
-    on_floor = np.column_stack([points, np.full(len(points), _LINE_HEIGHT)]).astype(np.float32)
-    segments = np.stack([on_floor[:-1], on_floor[1:]], axis=1)
-    return segments[::_DASH] if path.dashed else segments
+def _opacity(alpha: float) -> float | None:
+    return None if alpha == 1 else alpha
+
+
+def _segments(paths: Sequence[GroundPath]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2, 3) the line segments of paths, at most `_MOST_SEGMENTS` each, m, and the colours of their ends."""
+    segments, colors = [np.zeros((0, 2, 3), np.float32)], [np.zeros((0, 2, 3), np.uint8)]
+    for path in paths:
+        points = path.points
+        if len(points) > _MOST_SEGMENTS:
+            points = points[np.linspace(0, len(points) - 1, _MOST_SEGMENTS + 1).round().astype(int)]
+        on_floor = np.column_stack([points, np.full(len(points), _LINE_HEIGHT)])
+        segments.append(np.stack([on_floor[:-1], on_floor[1:]], axis=1)[:: _DASH if path.dashed else 1])
+        colors.append(np.full(segments[-1].shape, rgb(path.color)))
+    return np.concatenate(segments, dtype=np.float32), np.concatenate(colors, dtype=np.uint8, casting="unsafe")
 
 
 def _dragged(event: Any) -> np.ndarray:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ballbot_gym.drawing import Drawing, GroundPath, Robot, pose
+from ballbot_gym.drawing import FORCE, PUSH, Drawing, GroundPath, Robot, pose
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.viewer import Viewer, _dragged
@@ -37,17 +37,19 @@ def test_the_page_shows_robots_arrows_paths_and_markers_where_they_are(viewer, p
     markers = (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)), Marker((1, 0), 2, 0, (0, 0, 1, 1), ring=True))
     viewer.draw(Drawing(params, (ghost, robot), (path,), markers))
     shown, place = nodes(viewer), pose(params, STATE)
-    assert shown["/world/robot0/ball"].position == pytest.approx(place.ball)
-    assert shown["/world/robot0/body"].wxyz == pytest.approx(place.turn)
-    assert shown["/world/line1"].points.shape == (2, 2, 3)
-    start, end = shown["/world/robot0/force"].points[0]
+    assert shown["/world/bodies/robot0/ball"].position == pytest.approx(place.ball)
+    assert shown["/world/bodies/robot0/body"].wxyz == pytest.approx(place.turn)
+    assert shown["/world/lines"].points[-2:, :, :2] == pytest.approx(np.array([[[0, 0], [1, 0]], [[1, 0], [1, 1]]]))
+    assert shown["/world/lines"].colors.shape == shown["/world/lines"].points.shape == (48 + 2, 2, 3)  # with the ring
+    ((start, end),) = shown[f"/world/{FORCE}"].points
     assert end - start == pytest.approx([0.5, 0, 0])
-    assert shown["/world/robot1/label"].text == "LQR fell"
-    assert [shown[f"/world/robot{i}/push"].visible for i in (0, 1)] == [True, False]
-    assert {"/world/line0", "/world/post0"} <= set(shown)
+    assert shown["/world/bodies/robot1/label"].text == "LQR fell"
+    assert len(shown[f"/world/{PUSH}"].points) == 1
+    assert "/world/bodies/post0" in shown
     viewer.draw(Drawing(params, (Robot(STATE),), (GroundPath(np.zeros((300, 2)), "#e08a00"),)))
-    assert "/world/robot1/ball" not in nodes(viewer)
-    assert len(nodes(viewer)["/world/line0"].points) == 120
+    assert "/world/bodies/robot1/ball" not in nodes(viewer)
+    assert len(nodes(viewer)["/world/lines"].points) == 120
+    assert len(nodes(viewer)[f"/world/{FORCE}"].points) == 0
     viewer.draw(Drawing(params, ()))
     assert set(nodes(viewer)) == empty
 
