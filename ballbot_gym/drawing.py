@@ -28,7 +28,6 @@ PUSH_SCALE = 1 / 130
 """Length of a push's arrow, m/(N·s)."""
 LEAST_FORCE = 2.0
 """N: smaller forces get no arrow."""
-_FARTHEST = 3.0  # m from the last robot: who is farther may leave the picture
 
 
 @dataclass(frozen=True)
@@ -71,12 +70,6 @@ class Drawing:
     def centre(self) -> np.ndarray:
         """(2,) where the last robot is, m; the origin if there is no robot."""
         return self.robots[-1].x[:2] if self.robots else np.zeros(2)
-
-    @property
-    def spread(self) -> float:
-        """How far others are from the last robot, m, at most `_FARTHEST`."""
-        distances = (math.hypot(*(robot.x[:2] - self.centre)) for robot in self.robots)
-        return min(max(distances, default=0.0), _FARTHEST)
 
     @property
     def lines(self) -> tuple[GroundPath, ...]:

@@ -16,7 +16,7 @@ from ballbot_gym.tasks.marker import Marker
 
 YAW = math.radians(-55)
 """Direction in which pictures look, rad from the y axis, positive to the left: from behind a robot that moves along x."""
-_PITCH, _DISTANCE = math.radians(20), 3.4  # rad, m
+_PITCH, _DISTANCE, _FARTHEST = math.radians(20), 3.4, 6.4  # rad, m, m
 _HALF_HEIGHT = 0.42  # of the view, as a tangent
 _AIM_HEIGHT = 0.55  # m above the floor
 _NEAR = 0.4  # m: what is closer to the camera's plane is not drawn
@@ -75,7 +75,8 @@ class _Painter:
         self._drawing = drawing
         ahead = np.array([-math.sin(YAW) * math.cos(_PITCH), math.cos(YAW) * math.cos(_PITCH), -math.sin(_PITCH)])
         right = np.array([math.cos(YAW), math.sin(YAW), 0.0])
-        self._eye = np.array([*drawing.centre, _AIM_HEIGHT]) - (_DISTANCE + drawing.spread) * ahead
+        spread = max((math.dist(robot.x[:2], drawing.centre) for robot in drawing.robots), default=0.0)
+        self._eye = np.array([*drawing.centre, _AIM_HEIGHT]) - min(_DISTANCE + spread, _FARTHEST) * ahead
         self._axes = np.stack([right, np.cross(right, ahead), ahead])
         self._image = Image.new("RGB", (_FINE * width, _FINE * height), tuple(_FLOOR.tolist()))
         self._pen = ImageDraw.Draw(self._image)

@@ -9,7 +9,7 @@ from ballbot_gym.viewer import PORT, Viewer, import_viser
 from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.play.live_page import PlayPage
-from ballbot_train.play.simulation import Episode, Playground
+from ballbot_train.play.simulation import Playground, Start
 
 
 def play(
@@ -17,7 +17,7 @@ def play(
     /,
     controller: str | None = None,
     ghosts: tuple[str, ...] = ("lqr",),
-    episode: Episode | None = None,
+    episode: Start | None = None,
     physics: Literal["bullet", "mujoco", "rk4"] | None = None,
     robot: RobotName = PAPER,
     seed: int = 0,

@@ -18,7 +18,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.console import markdown_text
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Episode, Playground
+from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Playground, Start
 from ballbot_train.report import labels
 
 PATIENCE = 0.1
@@ -143,7 +143,7 @@ class PlayPage:
             group = gui.add_button_group(" ", tuple(actions), hint="keys: space, R and N")
             group.on_click(self._asking(lambda _, button: actions[button]()))
             self.speed = gui.add_slider("Speed", _SLOWEST, _FASTEST, step=0.1, initial_value=1.0)
-            episodes: dict[str, Episode] = {"rest": "rest", "random": "random"}
+            episodes: dict[str, Start] = {"rest": "rest", "random": "random"}
             episodes |= {str(i): i for i in range(certified.EPISODES)}
             shown = gui.add_dropdown("Episode", tuple(episodes))
             self._bind(shown, lambda name: playground.begin(episodes[name]), lambda: str(playground.episode))

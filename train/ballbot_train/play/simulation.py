@@ -42,7 +42,7 @@ _TRACE_STEPS = 400  # control steps that the trace on the floor goes back
 _PLAN_POINTS = 60  # of a drawn plan
 
 
-Episode = int | Literal["rest", "random"]
+Start = int | Literal["rest", "random"]
 """The index of a certified episode, one that stands at the origin until it is pushed, or one with another start."""
 
 PLANT: dict[str, tuple[str, float, float, float]] = {
@@ -202,7 +202,7 @@ class Playground:
         controller: str | None = None,
         ghosts: Sequence[str] = (),
         physics: str | None = None,
-        episode: Episode = 0,
+        episode: Start = 0,
         seed: int = 0,
         robot: str = PAPER,
         randomization: str | None = None,
@@ -233,7 +233,7 @@ class Playground:
         """The main robot, then the ghosts."""
         self.notice = ""
         """What went wrong last, in words."""
-        self.episode: Episode = episode
+        self.episode: Start = episode
         self._files: list[str] = []
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
@@ -393,7 +393,7 @@ class Playground:
         """Begins the same episode again."""
         self._begin(self.start, self.episode)
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: Start) -> None:
         """Begins a certified episode, by its index, a random one, or one that stands at the origin until it is pushed, which
         happens by itself.
         """
@@ -412,7 +412,7 @@ class Playground:
 
     # --- inside ---
 
-    def _open(self, world: World, controllers: Iterable[str], episode: Episode) -> None:
+    def _open(self, world: World, controllers: Iterable[str], episode: Start) -> None:
         made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
         self.close()
         self.world = world
@@ -435,7 +435,7 @@ class Playground:
             controller.reset(self.seconds, np.array(self.main.x), self.start[1])
         return controller
 
-    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: Episode) -> None:
+    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: Start) -> None:
         """Begins an episode. A controller that finds no plan is replaced by LQR."""
         self.start, self.episode = start, episode
         self.elapsed = self._pause_left = self._push_until = 0

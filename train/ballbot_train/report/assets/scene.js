@@ -20,7 +20,7 @@ void main() {
   at = world.xyz; up = mat3(place) * normal;
   gl_Position = camera * world;
 }`;
-const [PLAIN, LIT, FLOOR, DASHED] = [0, 1, 2, 3]; // looks: of one colour, of one colour in the light, the floor's squares, and with gaps
+const [PLAIN, LIT, FLOOR, DASHED] = [0, 1, 2, 3]; // looks: of one colour, the same in the light, the floor's squares, with gaps
 const FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 at, up;
@@ -113,7 +113,7 @@ function everyFrame(step, last = performance.now()) {
   });
 }
 
-/** Points of a robot of these measures in state x, m, and its body's axes, the last one upwards. γ turns about y, then θ about the turned −x. */
+/** A robot's points in state x, m, and its body's axes, the last one upwards. γ turns about y, then θ about the turned −x. */
 function pose({ ball_radius, com_height, body_length }, x) {
   const [sg, cg, st, ct] = [Math.sin(x[2]), Math.cos(x[2]), Math.sin(x[3]), Math.cos(x[3])];
   const axes = [[cg, 0, -sg], [-sg * st, ct, -cg * st], [sg * ct, st, cg * ct]];
