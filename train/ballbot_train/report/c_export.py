@@ -80,7 +80,8 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
     spec, params, networks = network.spec, named_robot(robot), layers_of(network)
     source = render(
         "controller.c.j2",
-        about=_comment(about),
+        # lines of a C comment, which no text from a file can end
+        about=printable("\n".join(f"{name}: {value}" for name, value in about.items())).replace("*", "×"),
         spec=spec,
         params=params,
         task=task,
@@ -96,7 +97,7 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         test=_test(network, task, robot, filtered),
         largest_error=c_number(LARGEST_ERROR),
         number=c_number,
-        numbers=_numbers,
+        numbers=lambda values: textwrap.fill(", ".join(map(c_number, values.ravel())), 120),
         exact=lambda values: textwrap.fill(", ".join(map(repr, values.tolist())), 120),
     )
     return str(source)
@@ -149,13 +150,3 @@ def _test(network: PolicyNetwork, task: Task, robot: str, filtered: bool) -> dic
     if not np.isfinite(actions).all():
         raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
     return arrays | {"constants": c if c.size else np.zeros(1), "times": times, "actions": actions.clip(-1, 1)}
-
-
-def _numbers(values: np.ndarray) -> str:
-    """Numbers as C lists them."""
-    return textwrap.fill(", ".join(c_number(value) for value in values.ravel()), 120)
-
-
-def _comment(about: dict[str, str]) -> str:
-    """Lines of a C comment, which no text from a file can end."""
-    return printable("\n".join(f"{name}: {value}" for name, value in about.items())).replace("*", "×")

@@ -105,7 +105,7 @@ def robustness_figure(rows: Sequence[Row], task: str) -> Figure:
             below.fill_between(levels, low, high, color=shade, alpha=0.15, lw=0)
         above.set(ylim=(-4, 104), title=stress)
         below.set_yscale("symlog", linthresh=1)
-        below.set_xlabel(_folded(STRESSES[stress].label), fontsize=9)
+        below.set_xlabel(textwrap.fill(STRESSES[stress].label, 28), fontsize=9)
         for axis in (above, below):
             axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("success, %")
@@ -157,10 +157,6 @@ def plain(figure: Figure) -> None:
             axis.set_minor_formatter(LogFormatter())
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _folded(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, 28))
 
 
 def _draw_path(axis: Axes, takes: Sequence[Take], markers: Sequence[Marker]) -> None:

@@ -99,15 +99,11 @@ def _frame(replay: Replay, t: float, width: int, height: int, line: int, columns
         shown = picture(replay.drawing(take, t), max(right - left, 1), max(bottom - top, 1))
         frame.paste(Image.fromarray(shown), (left, top))
         label, slip = textwrap.fill(take.label, letters), take.slip_at(t)
-        tilt = f"{_tilt(take.trajectory.state(t)):.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
+        lean = math.degrees(dynamics.tilt(take.trajectory.state(t)))
+        tilt = f"{lean:.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
         pen.text((left + 3, top + 2), label, take.color, font)
         pen.text((left + 3, top + 3 * line // 2 * (1 + label.count("\n"))), tilt, take.color, large)
         if t >= take.trajectory.duration or not take.failed:
             note = "\n".join(textwrap.fill(part, letters) for part in take.note.split("; "))
             pen.text((right - 4, bottom - 4), note, _FAILED if take.failed else "#333333", font, "rd", align="right")
     return np.asarray(frame)
-
-
-def _tilt(x: np.ndarray) -> float:
-    """In degrees."""
-    return math.degrees(dynamics.tilt(x))

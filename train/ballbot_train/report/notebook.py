@@ -33,7 +33,16 @@ def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Bal
     """See `ballbot_gym.display.Moving.show`."""
     takes = tuple(replace(take, trajectory=playable(take.trajectory, take.label)) for take in _takes(shown, names))
     title = " and ".join(take.label for take in takes)
-    return _show(Replay(title, takes, _markers(shown), checked_robot(robot)))
+    page = report_page(title, [Replay(title, takes, _markers(shown), checked_robot(robot))])
+    if _in_notebook():
+        style = f"width:100%;height:{_HEIGHT}px;border:0"
+        frame = f'<iframe srcdoc="{html.escape(page)}" title="replay" style="{style}"></iframe>'
+        display = import_module("IPython.display")
+        display.display(display.HTML(f"<div>{frame}</div>"))  # IPython warns of an iframe alone
+        return None
+    path = files.write(Path(tempfile.mkdtemp(prefix="ballbot-")) / "replay.html", page)
+    webbrowser.open(path.as_uri())
+    return path
 
 
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
@@ -75,19 +84,6 @@ def _takes(shown: Sequence[Moving], names: Sequence[str]) -> list[Take]:
 
 def _markers(shown: Sequence[Moving]) -> tuple[Marker, ...]:
     return tuple(dict.fromkeys(marker for one in shown for marker in getattr(one, "markers", ())))
-
-
-def _show(replay: Replay) -> Path | None:
-    page = report_page(replay.title, [replay])
-    if _in_notebook():
-        style = f"width:100%;height:{_HEIGHT}px;border:0"
-        frame = f'<iframe srcdoc="{html.escape(page)}" title="replay" style="{style}"></iframe>'
-        display = import_module("IPython.display")
-        display.display(display.HTML(f"<div>{frame}</div>"))  # IPython warns of an iframe alone
-        return None
-    path = files.write(Path(tempfile.mkdtemp(prefix="ballbot-")) / "replay.html", page)
-    webbrowser.open(path.as_uri())
-    return path
 
 
 def _figure(figure: Figure) -> Figure:

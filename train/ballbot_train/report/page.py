@@ -97,20 +97,16 @@ def asset(name: str) -> Markup:
 
 
 def _episode_data(replay: Replay) -> dict[str, object]:
+    """With the moment that is shown first: that of the greatest lean of a robot that does not fall."""
+    standing = [take for take in replay.takes if not take.failed] or replay.takes
+    leaning = max((take.trajectory for take in standing), key=lambda trajectory: trajectory.tilt.max())
     return {
         "title": replay.title,
         "dt": _REPLAY_DT,
-        "poster": _poster(replay),
+        "poster": float(leaning.t[leaning.tilt.argmax()]),
         "markers": [asdict(marker) for marker in replay.markers],
         "takes": [_take_data(take) for take in replay.takes],
     }
-
-
-def _poster(replay: Replay) -> float:
-    """The moment that a replay shows first: that of the greatest lean of a robot that does not fall, s."""
-    standing = [take for take in replay.takes if not take.failed] or replay.takes
-    leaning = max((take.trajectory for take in standing), key=lambda trajectory: trajectory.tilt.max())
-    return float(leaning.t[leaning.tilt.argmax()])
 
 
 def _take_data(take: Take) -> dict[str, object]:
