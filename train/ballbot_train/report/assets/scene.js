@@ -53,7 +53,6 @@ const Vector = {
   minus: (a, b) => a.map((v, i) => v - b[i]),
   plus: (a, b, scale = 1) => a.map((v, i) => v + scale * b[i]),
   times: (a, s) => a.map((v) => v * s),
-  dot: (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0),
   cross: (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]],
   unit: (a) => Vector.times(a, 1 / Math.hypot(...a)),
 };
