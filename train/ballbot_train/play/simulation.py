@@ -398,7 +398,7 @@ class Playground:
         happens by itself.
         """
         task, known = self.world.task, self.world.certified
-        if isinstance(episode, str):
+        if episode in ("rest", "random"):
             x, c = task.sample(self._rng, self.world.params)
             self._begin((np.zeros(8) if episode == "rest" else x, c), episode)
         elif known is None:
