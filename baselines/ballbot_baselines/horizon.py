@@ -5,8 +5,7 @@ Where there are more control steps than nodes, the later intervals hold theirs l
 """
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import NamedTuple
+from functools import lru_cache
 
 import casadi
 import numpy as np
@@ -25,33 +24,6 @@ _GRIP_UNIT = 0.1  # of `dynamics.limits`; this much costs as much as a unit of a
 _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
-
-
-class _Places(NamedTuple):
-    """Where things stand in the arrays of an inner stage, for states of n components and inputs of m."""
-
-    # Variables: changes of the state and of the input, and the slack of margins and grip.
-    x: slice
-    a: slice
-    slack: int
-    # Its Hessian, one dense block after the other: of the state (n, n), of the input (m, m), of the slack.
-    q: slice
-    r: slice
-    of_slack: int
-    # Its constraints: the gap to the next state, then the margins, then the limits of the robot's grip.
-    gap: slice
-    limits: slice
-    # Column of a state in the constraints' matrix: −1 in the gap of the stage before, the slopes of the next state, and the
-    # slopes of the margins and of the grip.
-    next: slice
-    slopes: slice
-
-    @classmethod
-    def of(cls, n: int, m: int) -> "_Places":
-        squares, rest = (slice(0, n * n), slice(n * n, n * n + m * m), n * n + m * m), slice(n, None)
-        return cls(
-            slice(0, n), slice(n, n + m), n + m, *squares, slice(0, n), rest, slice(1, n + 1), slice(n + 1, None)
-        )
 
 
 @dataclass(frozen=True)
@@ -85,14 +57,21 @@ class Grid:
         return np.add.reduceat(later, self.offsets[:-1], axis=0) / self.lengths[:, None]
 
 
-class _Stages:
-    """An array of the solver; parts of it belong to the first stage, to the inner stages (count, width), and to the last."""
+class _Pattern:
+    """Where a matrix (height, width) has entries: in blocks, of rows (K, r) and columns (K, c) of K dense parts each."""
 
-    def __init__(self, first: int, count: int, width: int, last: int, value: float = 0.0):
-        end = first + count * width
-        self.all = np.full(end + last, value)
-        self.first, self.last = self.all[:first], self.all[end:]
-        self.inner = self.all[first:end].reshape(count, width)
+    def __init__(self, height: int, width: int, *blocks: tuple[np.ndarray, np.ndarray]):
+        present = np.zeros((width, height), bool)
+        for rows, columns in blocks:
+            present[columns[:, :, None], rows[:, None]] = True
+        columns, rows = np.nonzero(present)
+        self.sparsity = casadi.Sparsity.triplet(height, width, rows.tolist(), columns.tolist())
+        self._places = np.full(present.shape, -1)
+        self._places[columns, rows] = np.arange(len(rows))
+
+    def places(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """(K, c, r) where a block's entries stand among all, which are sorted by columns."""
+        return self._places[columns[:, :, None], rows[:, None]]
 
 
 class HorizonQp:
@@ -116,7 +95,6 @@ class HorizonQp:
     def __init__(self, task: Task, kind: RobotKind, nodes: int):
         """Differentiates the stage and builds the solver; compiles on first use on a machine. `set_robot` must follow."""
         self._states, self._inputs = kind.states, kind.inputs
-        self._at = _Places.of(self._states, self._inputs)
         count = len(task.margins((0.0,) * self._states, (1.0,) * (len(task.constant_names) + task.clock)))
         self.distinct = np.arange(count)
         self.disturbance: DisturbanceEstimator | None = None
@@ -154,41 +132,47 @@ class HorizonQp:
         self._grip, self._grip_jacobian = grip if grips else none
 
     def _make_program(self, n: int, m: int, grips: int) -> None:
-        rows, slack = m + grips, int(grips > 0)  # of the first stage, if there is a grip
-        at, states, inputs = self._at, self._states, self._inputs
-        variables = partial(_Stages, inputs + slack, n - 1, at.slack + 1, states)
-        constraints = partial(_Stages, states + grips, n - 1, states + rows, 0)
-        # entries of the constraints' matrix
-        of_states, of_inputs = states * (states + 1 + rows), inputs * (states + grips)
-        a = _Stages(of_inputs + grips, n - 1, of_states + of_inputs + rows, states)
-        self._h = _Stages(inputs**2 + slack, n - 1, at.of_slack + 1, states**2)
-        self._g, self._z = variables(), variables()
-        self._low, self._high = constraints(), constraints()
-        self._lower, self._upper = variables(-np.inf), variables(np.inf)
-        self._cost, multipliers = np.zeros(1), constraints()
-        self._grip_multipliers = (
-            multipliers.first[states:],
-            multipliers.inner[:, states + m :],
-        )  # of the last program, ≤ 0
-        self._program = InPlace(
-            _solver(n, m, grips, states, inputs),
-            # HPIPM's interface reads every input and writes every output, so all have an array.
-            [
-                *(array.all for array in (self._h, self._g, a, self._low, self._high, self._lower, self._upper)),
-                *(array.all for array in (variables(), variables(), constraints())),
-            ],
-            [self._z.all, self._cost, multipliers.all, variables().all],
+        states, inputs, stage = self._states, self._inputs, np.arange(n + 1)[:, None]
+        # Variables of a stage: x, a, and the slack of margins and grip. There is no x_0, and without grip no s_0.
+        first = stage * (states + inputs + 1) - states - (not grips) * (stage > 0)
+        self._x_at, self._a_at = first[1:] + np.arange(states), first[:-1] + states + np.arange(inputs)
+        slack = first[0 if grips else 1 : -1] + states + inputs
+        # Constraints of a stage: the gap to the next state, margins but in the first stage, and the limits of the grip.
+        last = stage[:-1] * (states + m + grips) + states
+        self._gap_at, self._grip_at = last - states - m * (stage[:-1] > 0) + np.arange(states), last + np.arange(grips)
+        self._margin_at = last[1:] - m + np.arange(m)
+        inner, width, height = self._x_at[:-1], self._x_at[-1, -1] + 1, last[-1, 0] + grips
+        next_states = self._gap_at.reshape(-1, 1), self._x_at.reshape(-1, 1)
+        slacks = (self._margin_at, slack[1 - n :]), (self._grip_at[-len(slack) :], slack)
+        slopes = (
+            (self._gap_at, self._a_at),
+            (self._gap_at[1:], inner),
+            (self._margin_at, inner),
+            (self._grip_at, self._a_at),
+            (self._grip_at[1:], inner),
         )
-        self._a0 = a.first[:of_inputs].reshape(inputs, states + grips)
-        self._a_x = a.inner[:, :of_states].reshape(n - 1, states, states + 1 + rows)
-        self._a_u = a.inner[:, of_states : of_states + of_inputs].reshape(n - 1, inputs, states + grips)
+        a = _Pattern(height, width, next_states, *slacks, *slopes)
+        h = _Pattern(width, width, (self._x_at, self._x_at), (self._a_at, self._a_at), (slack, slack))
+        self._slopes_at = [a.places(*block) for block in slopes]
+        self._q_at, self._r_at = h.places(self._x_at, self._x_at), h.places(self._a_at, self._a_at)
+
+        self._h, self._a = np.zeros(h.sparsity.nnz()), np.zeros(a.sparsity.nnz())
+        self._g, self._z, self._lower, self._upper, *unused = np.zeros((7, width))
+        self._low, self._high, self._multipliers, none = np.zeros((4, height))
+        self._cost = np.zeros(1)
+        self._program = InPlace(
+            _solver(n, m, grips, h.sparsity, a.sparsity, states, inputs),
+            # HPIPM's interface reads every input and writes every output, so all have an array.
+            [self._h, self._g, self._a, self._low, self._high, self._lower, self._upper, *unused[:2], none],
+            [self._z, self._cost, self._multipliers, unused[2]],
+        )
         # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
-        self._a_x[:, :, 0], a.last[:] = -1.0, -1.0
-        a.first[of_inputs:], a.inner[:, of_states + of_inputs :] = 1.0, 1.0
-        self._lower.first[inputs:], self._lower.inner[:, at.slack] = 0.0, 0.0
-        self._h.first[inputs**2 :], self._h.inner[:, at.of_slack] = _SLACK_CURVATURE, _SLACK_CURVATURE
-        self._g.first[inputs:], self._g.inner[:, at.slack] = _SLACK_PRICE, _SLACK_PRICE
-        self._high.first[at.limits], self._high.inner[:, at.limits] = np.inf, np.inf
+        self._a[a.places(*next_states)] = -1.0
+        for block in slacks:
+            self._a[a.places(*block)] = 1.0
+        self._lower[self._x_at], self._upper[:] = -np.inf, np.inf
+        self._h[h.places(slack, slack)], self._g[slack] = _SLACK_CURVATURE, _SLACK_PRICE
+        self._high[self._margin_at] = self._high[self._grip_at] = np.inf
 
     def set_robot(self, params: BallbotParams) -> None:
         """Sets the robot of the model: one of the kind that the program was made for, which rolls and grips or does not."""
@@ -207,8 +191,7 @@ class HorizonQp:
             target: (8,) state.
         """
         self._r = r + _LEAST_CURVATURE * np.eye(self._inputs)
-        self._h.inner[:, self._at.q] = q[1:].reshape(len(q) - 1, -1)
-        self._h.last[:] = 2 * p.ravel()
+        self._h[self._q_at[:-1]], self._h[self._q_at[-1]] = q[1:], 2 * p
         self._beyond = p, slope, target
 
     def iterate(self, margin: float) -> bool:
@@ -217,7 +200,7 @@ class HorizonQp:
         Args:
             margin: least value of the task's margins, in their own units.
         """
-        x, a, at, inputs = self.x, self.a, self._at, self._inputs
+        x, a, states = self.x, self.a, self._states
         self._stage()
         if self.disturbance is not None:
             rates, slopes = self.disturbance.rates(self.x, self.a)
@@ -226,40 +209,29 @@ class HorizonQp:
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)
-        r = self._r if not self.curvature.any() else self._r + self.curvature[:, None, None] * np.eye(inputs)
-        self._h.first[: inputs**2], self._h.inner[:, at.r] = r[0].ravel(), r[1:].reshape(len(r) - 1, -1)
+        r = self._r if not self.curvature.any() else self._r + self.curvature[:, None, None] * np.eye(self._inputs)
         p, slope, target = self._beyond
-        self._g.first[:inputs], self._g.inner[:, : at.slack] = self._gradient[0, at.a], self._gradient[1:-1]
-        self._g.last[:] = slope + 2 * p @ (x[-1] - target)
-        self._lower.first[:inputs], self._upper.first[:inputs] = -1 - a[0], 1 - a[0]
-        self._lower.inner[:, at.a], self._upper.inner[:, at.a] = -1 - a[1:-1], 1 - a[1:-1]
+        self._h[self._r_at], self._g[self._a_at] = r, self._gradient[:-1, states:]
+        self._g[self._x_at[:-1]] = self._gradient[1:-1, :states]
+        self._g[self._x_at[-1]] = slope + 2 * p @ (x[-1] - target)
+        self._lower[self._a_at], self._upper[self._a_at] = -1 - a[:-1], 1 - a[:-1]
         if not (self._program() and self._program.solved and np.isfinite(self._cost[0])):
             return False
-        a[0] += self._z.first[:inputs]
-        a[1:-1] += self._z.inner[:, at.a]
-        x[1:-1] += self._z.inner[:, at.x]
-        x[-1] += self._z.last
+        a[:-1] += self._z[self._a_at]
+        x[1:] += self._z[self._x_at]
         if self._grip.shape[1]:
-            first, inner = self._grip_multipliers
-            cones = np.concatenate([first[None], inner])[:, 1::2]
+            cones = self._multipliers[self._grip_at][:, 1::2]  # ≤ 0
             self.curvature = self._cone_curvature * np.maximum(-cones, 0.0).sum(1)
         return True
 
     def _set_constraints(self, margin: float) -> None:
-        jacobian, low, high, at = self._jacobian, self._low, self._high, self._at
-        gaps = self.x[1:] - self._next[:-1]
-        self._a0[:, at.gap] = jacobian[0, at.a]
-        self._a_x[:, :, at.next], self._a_u[:, :, at.gap] = jacobian[1:-1, at.x], jacobian[1:-1, at.a]
-        low.first[at.gap] = high.first[at.gap] = gaps[0]
-        low.inner[:, at.gap] = high.inner[:, at.gap] = gaps[1:]
+        jacobian, grip, states = self._jacobian[:-1], self._grip_jacobian[:-1], self._states
         margins, slopes = self._nearest_margins()
-        limits, of_states = low.inner[:, at.limits], self._a_x[:, :, at.slopes]
-        limits[:, : self._margins], of_states[:, :, : self._margins] = margin - margins, slopes
-        if self._grip.shape[1]:
-            grip = self._grip_jacobian
-            self._a0[:, at.limits], self._a_u[:, :, at.limits] = grip[0, at.a], grip[1:-1, at.a]
-            low.first[at.limits] = -self._grip[0]
-            limits[:, self._margins :], of_states[:, :, self._margins :] = -self._grip[1:-1], grip[1:-1, at.x]
+        found = jacobian[:, states:], jacobian[1:, :states], slopes, grip[:, states:], grip[1:, :states]
+        for at, values in zip(self._slopes_at, found, strict=True):
+            self._a[at] = values
+        self._low[self._gap_at] = self._high[self._gap_at] = self.x[1:] - self._next[:-1]
+        self._low[self._margin_at], self._low[self._grip_at] = margin - margins, -self._grip[:-1]
 
     def _nearest_margins(self) -> tuple[np.ndarray, np.ndarray]:
         """(N−1, m) the least of the inner nodes' distinct margins, and their slopes (N−1, 8, m)."""
@@ -313,16 +285,16 @@ def _stage_function(task: Task, kind: RobotKind) -> casadi.Function:
     return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if kind.wheels else SIMD)[0]
 
 
-def _solver(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Function:
+def _solver(
+    n: int, m: int, grips: int, h: casadi.Sparsity, a: casadi.Sparsity, states: int, inputs: int
+) -> casadi.Function:
     """HPIPM for n intervals with m margins and limits of grip at each node."""
-    state, action, slack = (casadi.Sparsity.dense(size, size) for size in (states, inputs, 1))
-    first_slack = [slack] if grips else []
     options = {
         "print_time": False,
         "error_on_fail": False,
         "N": n,
         "nx": [0] + [states] * n,
-        "nu": [inputs + len(first_slack)] + [inputs + 1] * (n - 1) + [0],
+        "nu": [inputs + (grips > 0)] + [inputs + 1] * (n - 1) + [0],
         "ng": [grips] + [m + grips] * (n - 1) + [0],
         "hpipm": {
             "mode": "speed_abs",  # a fourth faster, as it computes no residuals; costs agree to 0.03 %
@@ -331,21 +303,4 @@ def _solver(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Func
             **dict.fromkeys(("res_g_max", "res_b_max", "res_d_max", "res_m_max"), _RESIDUAL),
         },
     }
-    hessian = casadi.diagcat(action, *first_slack, *[state, action, slack] * (n - 1), state)
-    return casadi.conic("qp", "hpipm", {"h": hessian, "a": _constraint_pattern(n, m, grips, states, inputs)}, options)
-
-
-def _constraint_pattern(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Sparsity:
-    """Where the constraints' matrix has entries; the constants at the top of this file say their order."""
-    at = _Places.of(states, inputs)
-    first_rows, first_columns, height, width = states + grips, inputs + (grips > 0), states + m + grips, at.slack + 1
-    present = np.zeros((first_rows + (n - 1) * height, first_columns + (n - 1) * width + states), bool)
-    present[:first_rows, :inputs] = present[states:first_rows, inputs:first_columns] = True
-    for k in range(n):
-        row, column = first_rows + k * height, first_columns + k * width
-        before = row - height if k else 0
-        present[range(before, before + states), range(column, column + states)] = True
-        own = present[row : row + height, column : column + width]  # without rows in the last stage
-        own[:, at.x] = own[at.gap, at.a] = own[states + m :, at.a] = own[states:, at.slack :] = True
-    rows, columns = np.nonzero(present)
-    return casadi.Sparsity.triplet(*present.shape, rows.tolist(), columns.tolist())
+    return casadi.conic("qp", "hpipm", {"h": h, "a": a}, options)
