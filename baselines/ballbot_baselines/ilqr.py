@@ -169,7 +169,7 @@ class Ilqr:
             a: (J, n, 2) actions.
             steps: (J,) or one number of steps, n at most.
             lengths: (J,) or one length of a step, s; 1 where it is free.
-            given: (J, np) parameters: p of `shooting_ocp` but the first, and the bounds of a free length, s, or else, for
+            given: (J, np) parameters: p of `ocp_of` but the first, and the bounds of a free length, s, or else, for
                 tasks with a `rest`, a state (8,), P's upper triangle (36,), and the share of LQR's cost-to-go that counts.
             options: of the solver, or of each problem.
             multipliers, end_multipliers: (J, n, path constraints) and (J, constraints of the end) at first, of a solution of

@@ -20,7 +20,7 @@ import numpy as np
 
 from ballbot_baselines import righting
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
-from ballbot_baselines.shooting import Backoff, shooting_ocp, shooting_parameters
+from ballbot_baselines.shooting import Backoff, kind_of, ocp_of, shooting_parameters
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
@@ -91,7 +91,7 @@ def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray
 
 def _largest_lean_ocp(task: Task, params: BallbotParams) -> Ocp:
     """The task's problem with a free initial lean. The ninth state carries that lean to the end, where it is the reward."""
-    fixed = shooting_ocp(task, params)
+    fixed = ocp_of(*kind_of(task, params))
     price = _REGULARIZATION * task.control_dt
     same = np.zeros((1, 9))
     same[0, _LEAN], same[0, 8] = 1.0, -1.0

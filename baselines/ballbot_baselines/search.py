@@ -12,7 +12,7 @@ import numpy as np
 
 from ballbot_baselines import guess, righting, sides
 from ballbot_baselines.ocp import OcpSolution
-from ballbot_baselines.shooting import BARRIER, NEAR_BARRIER, Shooting, shooting_solver
+from ballbot_baselines.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, then_stay
@@ -85,8 +85,7 @@ def _any_optimal(found: list[Found]) -> bool:
 
 def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[Found]:
     """With fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
-    solver = shooting_solver(episode.task, episode.params, episode.task.steps, "fatrop", _QUICK_ITERATIONS, barrier)
-    return [(0, episode.solve(solver, *episode.along(path)))]
+    return [(0, episode.solve(*episode.along(path), barrier=barrier, iterations=_QUICK_ITERATIONS))]
 
 
 def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
@@ -99,7 +98,10 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
     """
     task = episode.task
     if task.first_exit:
-        tried = [(i, episode.relaxed_along(path)) for i, path in enumerate(paths)]
+        tried = []
+        for i, path in enumerate(paths):
+            h = (len(path) - 1) * task.control_dt / FREE_TIME_INTERVALS
+            tried.append((i, episode.relaxed(*episode.along(guess.resampled(path, FREE_TIME_INTERVALS), h), h)))
         found = [t for t in tried if not t[1].is_optimal]
         _note(episode, tried)
         for i, relaxed in _distinct([t for t in tried if t[1].is_optimal], BASIN_DOUBT):
@@ -107,9 +109,8 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
         return found
     if len(paths) == 1 or task.steps % COARSE:
         return _refined(episode, [], BASIN_DOUBT, paths)
-    solver = shooting_solver(task, episode.params, task.steps // COARSE)
     starts = [episode.along(path) for path in paths]
-    coarse = [(i, episode.solve(solver, x[::COARSE], a[::COARSE], COARSE)) for i, (x, a) in enumerate(starts)]
+    coarse = [(i, episode.solve(x[::COARSE], a[::COARSE], COARSE)) for i, (x, a) in enumerate(starts)]
     return _refined(episode, [t for t in coarse if t[1].is_optimal], BASIN_DOUBT, paths)
 
 
@@ -163,7 +164,7 @@ def _from_righting(episode: Shooting) -> list[Found]:
                 relaxed = episode.relaxed(x, u / limit, task.control_dt)
                 solved = episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
             else:
-                solved = [episode.solve(shooting_solver(task, params, len(u), "fatrop", barrier=BARRIER), x, u / limit)]
+                solved = [episode.solve(x, u / limit)]
             found += [(FROM_RIGHTING, solution) for solution in solved]
     return found
 
@@ -207,9 +208,8 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
         coarsest, tolerance = COARSE, None
 
     def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> OcpSolution:
-        solver = shooting_solver(task, params, task.steps // coarsest, "fatrop", iterations, barrier, tolerance)
-        x, a = episode.along(path)
-        return episode.solve(solver, x[::coarsest], a[::coarsest], coarsest)
+        x, a = (part[::coarsest] for part in episode.along(path))
+        return episode.solve(x, a, coarsest, barrier=barrier, iterations=iterations, tolerance=tolerance)
 
     free = solved_from(straight_path(task, params, x0, c), NEAR_BARRIER, replace(episode, c=task.without_obstacles(c)))
     if not free.success:
@@ -239,8 +239,8 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
 def _on_coarse_grid(episode: Shooting, solved: list[Found]) -> list[Found]:
     """Solutions with forces held for `COARSE` control steps, from those on the coarsest grid."""
     n = episode.task.steps // COARSE
-    solver = shooting_solver(episode.task, episode.params, n, "fatrop", _QUICK_ITERATIONS, NEAR_BARRIER, _ROUGH)
-    found = [(i, episode.solve(solver, *_on_grid(solution, n), COARSE)) for i, solution in solved]
+    rough = {"barrier": NEAR_BARRIER, "iterations": _QUICK_ITERATIONS, "tolerance": _ROUGH}
+    found = [(i, episode.solve(*_on_grid(solution, n), COARSE, **rough)) for i, solution in solved]
     return [(i, solution) for i, solution in found if solution.success]
 
 

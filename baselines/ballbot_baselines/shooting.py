@@ -113,21 +113,12 @@ def robot_numbers(params: BallbotParams) -> list[float]:
     return [getattr(params, name) for name in RobotKind(params.rolls, params.grips, False).names] + wheels
 
 
-def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
-    """A task on its env's discretization, or with forces held longer than its control steps.
-
-    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, then the
-    numbers of the robot. So problems on fine and coarse grids and of all robots of a kind share all compiled functions, and
-    all tasks share those of the dynamics.
+def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
+    """What problems are made for: a task, and a kind of robot.
 
     Raises:
         ValueError: no optimizer can use the task's formulas; see `check_formulas`.
     """
-    return ocp_of(*kind_of(task, params))
-
-
-def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
-    """What solvers are made for: a task whose formulas they can use, and a kind of robot."""
     kind = task, RobotKind.of(params)
     if kind not in _checked:
         check_formulas(task, params)
@@ -137,7 +128,12 @@ def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
 
 @lru_cache(maxsize=64)
 def ocp_of(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
-    """`shooting_ocp` of a kind of robot. With `free_time` one length of all intervals, s, is the last state."""
+    """A task on its env's discretization, or with forces held longer than its control steps.
+
+    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, then the
+    numbers of the robot. So problems on fine and coarse grids and of all robots of a kind share all compiled functions, and
+    all tasks share those of the dynamics. With `free_time` one length of all intervals, s, is the last state.
+    """
     n, nc, first = kind.states, len(task.constant_names), 1 + len(kind.names)
     margin, goal, reserve = range(first + nc, first + nc + 3)  # back-offs in p
 
@@ -194,37 +190,12 @@ def ocp_of(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
 def shooting_parameters(
     task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1, start: float = 0.0
 ) -> list[float]:
-    """p of `shooting_ocp`: s that forces are held, `robot_numbers`, c, back-offs from margins and goal, of grip if friction
+    """p of `ocp_of`: s that forces are held, `robot_numbers`, c, back-offs from margins and goal, of grip if friction
     is limited, and the episode's time at the start, s, if the task has a clock.
     """
     reserve = [backoff.grip] if params.grips else []
     numbers, clock = robot_numbers(params), [start] if task.clock else []
     return [task.control_dt * coarseness, *numbers, *c, backoff.margin, backoff.goal, *reserve, *clock]
-
-
-def shooting_solver(
-    task: Task,
-    params: BallbotParams,
-    steps: int,
-    solver: str = "fatrop",
-    iterations: int = _MOST_ITERATIONS,
-    barrier: float = BARRIER,
-    tolerance: float | None = None,
-    free_time: bool = False,
-) -> OcpSolver:
-    """A solver of `shooting_ocp`, made once for all robots of a kind.
-
-    Args:
-        steps: intervals.
-        solver: "fatrop" or "ipopt".
-        iterations: after which it gives up.
-        barrier: of the first iterate.
-        tolerance: of the solver; default, the finest that it reaches.
-        free_time: whether the intervals have one free length, the last state. It tells roughly when to arrive.
-    """
-    # On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits.
-    tolerance = tolerance or (1e-6 if params.grips else 1e-8)
-    return _solver(*kind_of(task, params), free_time, steps, solver, tolerance, iterations, barrier)
 
 
 @lru_cache(maxsize=256)
@@ -246,15 +217,45 @@ class Shooting:
     compared: dict[int, float] = field(default_factory=dict)
     """What guesses cost, by their index, that were solved on a coarser grid, or with free time, to choose among them."""
 
-    def along(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A guess that roughly follows a ground path (n+1, 2), m, one point for each control step."""
-        x, u = guess.along_path(self.params, path, self.task.control_dt, start=self.x0)
+    def along(self, path: np.ndarray, length: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """A guess that roughly follows a ground path (n+1, 2), m, one point every `length` s; default, the control step."""
+        x, u = guess.along_path(self.params, path, length or self.task.control_dt, start=self.x0)
         return x, u / self.params.force_limit
 
-    def solve(self, solver: OcpSolver, x: np.ndarray, a: np.ndarray, coarseness: int = 1) -> OcpSolution:
-        """From a guess by one solver; forces are held for `coarseness` control steps."""
-        bounds = self._bounds(solver, x[0], len(a))
-        return solver.solve(x, a, bounds, self._parameters(coarseness))
+    def solve(
+        self,
+        x: np.ndarray,
+        a: np.ndarray,
+        coarseness: int = 1,
+        solver: str = "fatrop",
+        barrier: float = BARRIER,
+        iterations: int = _MOST_ITERATIONS,
+        tolerance: float | None = None,
+    ) -> OcpSolution:
+        """From a guess by one solver, which is made once for all robots of a kind.
+
+        Args:
+            x: states; (n+1, 9) with a free length of all intervals, s, which tells roughly when to arrive.
+            a: actions.
+            coarseness: control steps for which forces are held.
+            solver: "fatrop" or "ipopt".
+            barrier: of the first iterate.
+            iterations: after which it gives up.
+            tolerance: of the solver; default, the finest that it reaches.
+        """
+        n, known, force, dt = len(a), self.params.state_size, self.backoff.force, self.task.control_dt
+        free_time = x.shape[1] > known
+        # On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits.
+        tolerance = tolerance or (1e-6 if self.params.grips else 1e-8)
+        made = _solver(*kind_of(self.task, self.params), free_time, n, solver, tolerance, iterations, barrier)
+        bounds = Bounds.free(made.ocp, n)
+        bounds.state_lower[0, :known] = bounds.state_upper[0, :known] = x[0, :known]
+        bounds.input_lower[:], bounds.input_upper[:] = force - 1, 1 - force
+        if free_time:
+            longest = self.task.duration / n
+            bounds.state_lower[:, -1], bounds.state_upper[:, -1] = min(dt / 4, longest), longest
+        p = shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness, self.start)
+        return made.solve(x, a, bounds, p)
 
     def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[OcpSolution]:
         """From a guess by fatrop, and if that fails by ipopt: all solutions, the best last.
@@ -267,27 +268,17 @@ class Shooting:
         tries = [("fatrop", NEAR_BARRIER)] if near else []
         solutions = []
         for name, barrier in (*tries, ("fatrop", BARRIER), ("ipopt", BARRIER)):
-            solver = shooting_solver(self.task, self.params, len(a), name, barrier=barrier)
-            solutions.append(self.solve(solver, x, a))
+            solutions.append(self.solve(x, a, solver=name, barrier=barrier))
             if solutions[-1].is_optimal:
                 break
         return solutions
 
-    def relaxed_along(self, path: np.ndarray) -> OcpSolution:
-        """The solution with a free interval length from a ground path (n+1, 2), m, one point for each control step."""
-        h = (len(path) - 1) * self.task.control_dt / FREE_TIME_INTERVALS
-        x, u = guess.along_path(self.params, guess.resampled(path, FREE_TIME_INTERVALS), h, start=self.x0)
-        return self.relaxed(x, u / self.params.force_limit, h)
-
     def relaxed(self, x: np.ndarray, a: np.ndarray, h: float) -> OcpSolution:
         """The solution with a free interval length from a guess with intervals of h s."""
-        n, longest = FREE_TIME_INTERVALS, self.task.duration / FREE_TIME_INTERVALS
-        x, a, h = *_resampled(x, a, n), h * len(a) / n
+        n, length = FREE_TIME_INTERVALS, h * len(a) / FREE_TIME_INTERVALS
+        x, a = _resampled(x, a, n)
         for name in ("fatrop", "ipopt"):
-            solver = shooting_solver(self.task, self.params, n, name, free_time=True)
-            bounds = self._bounds(solver, x[0], n)
-            bounds.state_lower[:, -1], bounds.state_upper[:, -1] = min(self.task.control_dt / 4, longest), longest
-            solution = solver.solve(np.column_stack([x, np.full(n + 1, h)]), a, bounds, self._parameters())
+            solution = self.solve(np.column_stack([x, np.full(n + 1, length)]), a, solver=name)
             if solution.is_optimal:
                 break
         return solution
@@ -314,15 +305,6 @@ class Shooting:
                     break
                 nearby += direction
         return [solution for group in groups.values() for solution in group]
-
-    def _bounds(self, solver: OcpSolver, x0: np.ndarray, n: int) -> Bounds:
-        bounds, force = Bounds.free(solver.ocp, n), self.backoff.force
-        bounds.state_lower[0, : len(x0)] = bounds.state_upper[0, : len(x0)] = x0
-        bounds.input_lower[:], bounds.input_upper[:] = force - 1, 1 - force
-        return bounds
-
-    def _parameters(self, coarseness: int = 1) -> list[float]:
-        return shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness, self.start)
 
 
 def _resampled(x: np.ndarray, a: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
