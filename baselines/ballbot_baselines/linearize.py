@@ -12,26 +12,12 @@ from ballbot_gym.tasks import Task
 _YAW_WEIGHT = 0.1  # of ψ², ψ̇² and ω_z², SI units, 1/s
 
 
-def linearize(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Linearizes the dynamics about one point.
-
-    Args:
-        params: the robot.
-        x: (8,) state; order and units in `dynamics.STATE`. With wheels it has 11 components, and u has 3.
-        u: (2,) ball force, N.
-
-    Returns:
-        A: (8, 8) and B: (8, 2), with d(xdot) = A dx + B du. At the origin they are the paper's (5) and (6).
-    """
-    a, b = _jacobians(params, None)(x, u)
-    return np.array(a), np.array(b)
-
-
 def discretize(params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Linearizes the control step (force held for dt s, RK4) about points of a trajectory.
 
     Args:
-        x: (n, 8) states.
+        params: the robot.
+        x: (n, 8) states; order and units in `dynamics.STATE`. With wheels they have 11 components, and forces have 3.
         u: (n, 2) forces, N.
         dt: s.
 
@@ -84,11 +70,10 @@ def _constants(task: Task, c: np.ndarray, t: np.ndarray | float, n: int) -> np.n
 
 
 @lru_cache(maxsize=64)  # controllers that estimate their robot come with many
-def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
-    """Of the state after a control step of dt, s; of the state's derivative for None."""
+def _jacobians(params: BallbotParams, dt: float) -> casadi.Function:
+    """Of the state after a control step of dt, s."""
     x, u = casadi.SX.sym("x", params.state_size), casadi.SX.sym("u", params.action_size)
-    held = dt is not None
-    out = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt)) if held else dynamics.derivative(params, x, u)
+    out = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
     outputs = [casadi.densify(casadi.jacobian(out, x)), casadi.densify(casadi.jacobian(out, u))]
     return casadi.Function("jacobians", [x, u], outputs, {"cse": True})
 

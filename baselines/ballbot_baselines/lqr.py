@@ -20,7 +20,7 @@ _GOAL_PRICE = 10.0  # cost per squared goal tolerance, for references that do no
 
 @dataclass(frozen=True)
 class Gains:
-    """Feedback u = u_ref − K (x − x_ref), with cost-to-go (x − x_ref)ᵀ P (x − x_ref): K (n, 2, 8), P (n, 8, 8)."""
+    """Feedback u = u_ref − K (x − x_ref), with cost-to-go (x − x_ref)ᵀ P (x − x_ref): K (n, 2, 8), P (n+1, 8, 8)."""
 
     k: np.ndarray
     p: np.ndarray
@@ -30,9 +30,15 @@ def discrete_lqr(
     task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx."""
-    dt = task.control_dt
+    q, r = (weight[0] * task.control_dt for weight in quadratic_cost(task, x[None], u[None], c, t))
+    return weighted_lqr(params, x, u, task.control_dt, q, r)
+
+
+def weighted_lqr(
+    params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float, q: np.ndarray, r: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """K (2, 8) and P (8, 8) about an equilibrium for weights q (8, 8) and r (2, 2) of a step of dt s."""
     a, b = (matrix[0] for matrix in discretize(params, x[None], u[None], dt))
-    q, r = (weight[0] * dt for weight in quadratic_cost(task, x[None], u[None], c, t))
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 
@@ -65,12 +71,16 @@ def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
     return bool(np.abs(dynamics.derivative(params, np.asarray(x), np.asarray(u))).max() < 1e-6)
 
 
-def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, t: float = 0.0) -> np.ndarray:
-    """(8, 8) cost-to-go at a trajectory's end: LQR's at an equilibrium, else `_GOAL_PRICE` per squared goal tolerance."""
+def lqr_at_end(
+    task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, t: float = 0.0
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """K (2, 8) and P (8, 8) where a trajectory ends: LQR's at an equilibrium, else None and `_GOAL_PRICE` per squared goal
+    tolerance.
+    """
     none = np.zeros(params.action_size)
     if is_equilibrium(params, x, none):
-        return discrete_lqr(task, params, x, none, c, t)[1]
-    return _GOAL_PRICE * goal_weight(task, x, c, t)
+        return discrete_lqr(task, params, x, none, c, t)
+    return None, _GOAL_PRICE * goal_weight(task, x, c, t)
 
 
 def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray) -> Gains:
@@ -83,8 +93,8 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final:
         r: (n, 2, 2) cost of each step, input part.
         p_final: (8, 8) cost-to-go at the end.
     """
-    k, p = np.zeros((*b.shape[::2], b.shape[1])), np.zeros(a.shape)
-    after = p_final
+    k, p = np.zeros((*b.shape[::2], b.shape[1])), np.zeros((len(a) + 1, *p_final.shape))
+    after = p[-1] = p_final
     for i in reversed(range(len(a))):
         weighted = b[i].T @ after
         k[i] = np.linalg.solve(r[i] + weighted @ b[i], weighted @ a[i])
@@ -107,19 +117,31 @@ def tracking_gains(
 
     The first point is at the episode's time `start`, s.
     """
-    a, b = discretize(params, x, u, task.control_dt)
-    q, r = quadratic_cost(task, x, u, c, start + task.control_dt * np.arange(len(x)))
-    return riccati(a, b, q * task.control_dt, r * task.control_dt, p_final)
+    return riccati(*_steps(task, params, x, u, c, start), p_final)
+
+
+def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
+    """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
+    steps, after = _steps(task, params, reference.x, reference.u, c), np.eye(reference.x.shape[1])
+    for _ in range(_MAX_ROUNDS):
+        gains = riccati(*steps, after)
+        if np.allclose(after, gains.p[0], rtol=1e-6):
+            return gains
+        after = gains.p[0]
+    raise RuntimeError(f"LQR around the closed motion of {task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
+
+
+def _steps(
+    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, start: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What `riccati` takes of the control steps at states x (n, 8) and forces u (n, 2)."""
+    dt = task.control_dt
+    q, r = quadratic_cost(task, x, u, c, start + dt * np.arange(len(x)))
+    return *discretize(params, x, u, dt), q * dt, r * dt
 
 
 def feedforward(
-    task: Task,
-    params: BallbotParams,
-    reference: Reference,
-    c: np.ndarray,
-    gains: Gains,
-    p_final: np.ndarray,
-    start: float = 0.0,
+    task: Task, params: BallbotParams, reference: Reference, c: np.ndarray, gains: Gains, start: float = 0.0
 ) -> np.ndarray:
     """(n, 2) forces, N, to add along an open reference that is no motion of the robot, or not the cheapest near it.
 
@@ -127,36 +149,21 @@ def feedforward(
     steps by which the reference misses the equations of motion count, and the slopes of the cost.
     """
     x, u, dt = reference.x, reference.u, task.control_dt
-    t = start + dt * np.arange(len(x))
-    a, b = discretize(params, x, u, dt)
-    _, r = quadratic_cost(task, x, u, c, t)
-    of_x, of_u = cost_slopes(task, x, u, c, t)
+    a, b, _, r = _steps(task, params, x, u, c, start)
+    of_x, of_u = cost_slopes(task, x, u, c, start + dt * np.arange(len(x)))
     missed = np.zeros_like(x)
     missed[:-1] = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))[:-1] - x[1:]
-    after = [*gains.p[1:], p_final]
     forces, slope = (
         np.zeros_like(u),
         np.zeros(x.shape[1]),
     )  # half the slope of the cost-to-go, which is xᵀPx + 2 slopeᵀx
     for i in reversed(range(len(x))):
-        slope = slope + after[i] @ missed[i]
+        after = gains.p[i + 1]
+        slope = slope + after @ missed[i]
         along = dt * of_u[i] / 2 + b[i].T @ slope
-        forces[i] = -np.linalg.solve(dt * r[i] + b[i].T @ after[i] @ b[i], along)
+        forces[i] = -np.linalg.solve(r[i] + b[i].T @ after @ b[i], along)
         slope = dt * of_x[i] / 2 + a[i].T @ slope - gains.k[i].T @ along
     return forces
-
-
-def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
-    """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
-    x, u, dt = reference.x, reference.u, task.control_dt
-    a, b = discretize(params, x, u, dt)
-    q, r = quadratic_cost(task, x, u, c, dt * np.arange(len(x)))
-    gains = Gains(np.zeros((0, u.shape[1], x.shape[1])), np.eye(x.shape[1])[None])
-    for _ in range(_MAX_ROUNDS):
-        before, gains = gains, riccati(a, b, q * dt, r * dt, gains.p[0])
-        if np.allclose(before.p[0], gains.p[0], rtol=1e-6):
-            return gains
-    raise RuntimeError(f"LQR around the closed motion of {task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
 
 
 class LqrController:
@@ -181,11 +188,12 @@ class LqrController:
         if reference.closed:
             self.gains = closed_gains(task, params, reference, c)
         else:
-            p_final = final_weight(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
+            _, p_final = lqr_at_end(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
             self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, t)
             if task.clock:
-                ahead = feedforward(task, params, reference, c, self.gains, p_final, t)
-                self.reference = replace(reference, u=reference.u + ahead)
+                self.reference = replace(
+                    reference, u=reference.u + feedforward(task, params, reference, c, self.gains, t)
+                )
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         reference = self.reference

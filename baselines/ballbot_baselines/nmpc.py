@@ -28,7 +28,6 @@ import numpy as np
 from ballbot_baselines.disturbance import DisturbanceEstimator
 from ballbot_baselines.horizon import Grid, horizon_qp
 from ballbot_baselines.linearize import quadratic_cost
-from ballbot_baselines.lqr import final_weight
 from ballbot_baselines.optimum import Optimum, plan_to_track
 from ballbot_baselines.shooting import Backoff, RobotKind
 from ballbot_baselines.tvlqr import TvlqrController
@@ -139,9 +138,7 @@ class NmpcController:
         self._length, self._step = len(trajectory.u), 0
         q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c, trajectory.t[:-1])
         self._q, self._r = 2 * q, 2 * r * robot.force_limit**2  # Hessians of the cost rate in states and actions
-        # of the cost-to-go from each state
-        p_final = final_weight(task, robot, trajectory.x[-1], c, trajectory.t[-1])
-        self._p = np.concatenate([self._tracker.gains.p, p_final[None]])
+        # of the cost-to-go from each state, whose second derivatives are the tracker's
         self._slopes = np.concatenate([np.zeros((1, robot.state_size)), plan.costates])
         # sums of the actions before each step
         sums = np.cumsum(trajectory.u, axis=0) / robot.force_limit
@@ -238,7 +235,9 @@ class NmpcController:
         times = self._trajectory.t[0] + dt * self._nodes
         qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._task.at(self._c, times), self._reserve
         at, weight = np.minimum(self._nodes[:-1], self._length - 1), (dt * self._lengths)[:, None, None]
-        qp.set_weights(self._q[at] * weight, self._r[at] * weight, self._p[end], self._slopes[end], self._x_plan[-1])
+        qp.set_weights(
+            self._q[at] * weight, self._r[at] * weight, self._tracker.gains.p[end], self._slopes[end], self._x_plan[-1]
+        )
 
     def _fall_back(self, x: np.ndarray) -> np.ndarray:
         """The last plan under TVLQR: the last solution, shifted, with the episode plan's gains."""

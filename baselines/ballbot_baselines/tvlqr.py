@@ -1,10 +1,9 @@
 """Time-varying LQR that keeps the robot on a planned trajectory."""
 
 import numpy as np
-import scipy.linalg
 
-from ballbot_baselines.linearize import discretize, quadratic_cost
-from ballbot_baselines.lqr import discrete_lqr, final_weight, is_equilibrium, riccati, tracking_gains
+from ballbot_baselines.linearize import discretize
+from ballbot_baselines.lqr import Gains, lqr_at_end, riccati, tracking_gains, weighted_lqr
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -18,31 +17,18 @@ class TvlqrController:
     Past the trajectory's end its last state is held by the last gain, which is LQR's where that state is an equilibrium.
     """
 
-    def __init__(
-        self,
-        params: BallbotParams,
-        trajectory: Trajectory,
-        dt: float,
-        q: np.ndarray,
-        r: np.ndarray,
-        p_final: np.ndarray,
-        end_gain: np.ndarray | None = None,
-    ):
-        """Computes the gains.
+    def __init__(self, trajectory: Trajectory, dt: float, gains: Gains, end_gain: np.ndarray | None = None):
+        """Takes the gains.
 
         Args:
             trajectory: what to track.
             dt: s, the control step.
-            q, r: (8, 8) and (2, 2) weights of a control step, or (n, …) one for each of the trajectory's n steps.
-            p_final: (8, 8) cost-to-go at the end.
+            gains: for each of the trajectory's n steps.
             end_gain: (2, 8) for what comes after the end; default, the last of the trajectory's.
         """
         self.x, self.u = _sampled(trajectory, dt)
-        a, b = discretize(params, self.x, self.u, dt)
-        n = len(self.x)
-        q, r = (np.broadcast_to(weight, (n, *np.shape(weight)[-2:])) for weight in (q, r))
-        self.gains = riccati(a, b, q, r, p_final)
-        self._end, self._end_gain = trajectory.x[-1], self.gains.k[-1] if end_gain is None else end_gain
+        self.gains = gains
+        self._end, self._end_gain = trajectory.x[-1], gains.k[-1] if end_gain is None else end_gain
         self._dt, self._start = dt, 0.0
 
     @classmethod
@@ -53,15 +39,10 @@ class TvlqrController:
 
         Its times are the episode's.
         """
-        c, dt, end = np.asarray(c, np.float64), task.control_dt, trajectory.x[-1]
-        x, u = _sampled(trajectory, dt)
-        q, r = quadratic_cost(task, x, u, c, trajectory.t[0] + dt * np.arange(len(x)))
-        none = np.zeros(params.action_size)
-        rest = is_equilibrium(params, end, none)
-        end_gain = discrete_lqr(task, params, end, none, c, trajectory.t[-1])[0] if rest else None
-        return cls(
-            params, trajectory, dt, q * dt, r * dt, final_weight(task, params, end, c, trajectory.t[-1]), end_gain
-        )
+        c, dt = np.asarray(c, np.float64), task.control_dt
+        end_gain, p_final = lqr_at_end(task, params, trajectory.x[-1], c, trajectory.t[-1])
+        gains = tracking_gains(task, params, *_sampled(trajectory, dt), c, p_final, trajectory.t[0])
+        return cls(trajectory, dt, gains, end_gain)
 
     @classmethod
     def for_weights(
@@ -71,11 +52,11 @@ class TvlqrController:
 
         Uniform motion upright linearizes like standing, so both end with LQR's cost-to-go.
         """
-        upright = np.zeros((1, params.state_size)), np.zeros((1, params.action_size))
-        a, b = (matrix[0] for matrix in discretize(params, *upright, dt))
-        p = scipy.linalg.solve_discrete_are(a, b, q * dt, r * dt)
-        gain = np.linalg.solve(r * dt + b.T @ p @ b, b.T @ p @ a)
-        return cls(params, trajectory, dt, q * dt, r * dt, p, gain)
+        upright = np.zeros(params.state_size), np.zeros(params.action_size)
+        gain, p = weighted_lqr(params, *upright, dt, q * dt, r * dt)
+        a, b = discretize(params, *_sampled(trajectory, dt), dt)
+        q, r = (np.broadcast_to(weight * dt, (len(a), *weight.shape)) for weight in (q, r))
+        return cls(trajectory, dt, riccati(a, b, q, r, p), gain)
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._start = t
@@ -93,7 +74,6 @@ def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.
     The gains are TVLQR's. If the task ends in its goal, only those goal functions that limit the optimum are weighted at its
     end. Weighting the whole goal would ask for forces that the optimum from a neighbouring state does not need.
     """
-    x, u = _sampled(trajectory, task.control_dt)
     end, h = trajectory.x[-1], 1e-5
     if task.first_exit:
         goal = np.array(task.goal(end, c), np.float64)
@@ -103,8 +83,8 @@ def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.
         active = slopes[:, goal > goal.max() - _ACTIVE]
         p_final = active @ active.T + 1e-3 * np.eye(len(end))
     else:
-        p_final = final_weight(task, params, end, c, trajectory.t[-1])
-    return tracking_gains(task, params, x, u, c, p_final, trajectory.t[0]).k
+        _, p_final = lqr_at_end(task, params, end, c, trajectory.t[-1])
+    return tracking_gains(task, params, *_sampled(trajectory, task.control_dt), c, p_final, trajectory.t[0]).k
 
 
 def _sampled(trajectory: Trajectory, dt: float) -> tuple[np.ndarray, np.ndarray]:
