@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 
 from ballbot_baselines import LqrController
-from ballbot_baselines.adaptive import adaptive_nmpc
+from ballbot_baselines.adaptive import AdaptiveNmpcController
 from ballbot_baselines.cautious import cautious_trajopt
 from ballbot_baselines.kalman import TrackFilter
 from ballbot_gym import certified
@@ -141,7 +141,7 @@ def test_a_policy_file_may_be_named_with_its_filter():
 def test_adaptive_nmpc_learns_robot_and_delay_in_a_second():
     drawn = Randomization(body_mass=(1.3, 1.3), com_height=(0.9, 0.9), force=(0.9, 0.9), actuator_delay=(0.04, 0.04))
     env = BallbotEnv("stabilize", physics="rk4", randomization=drawn)
-    controller = adaptive_nmpc(env.task, env.params)  # it is told the nominal robot
+    controller = AdaptiveNmpcController(env.task, env.params, "-adaptive")  # it is told the nominal robot
     _, info = env.reset(seed=0, options=certified.load("stabilize", "paper").options(0))
     controller.reset(0.0, info["state"], info["constants"])
     for k in range(50):

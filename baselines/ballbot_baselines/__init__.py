@@ -5,6 +5,7 @@ CasADi and SciPy are imported when one of them is first asked for, or a controll
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ballbot_gym.lazy import called, load, need
@@ -30,12 +31,13 @@ CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 }
 """Every controller by its name on the command line. To add a controller, write one file and add one line here."""
 
+_ADAPTIVE = called("ballbot_baselines.adaptive:AdaptiveNmpcController")
 VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
     "nmpc-offset-free": called("ballbot_baselines.nmpc:offset_free_nmpc"),
     "cautious": called("ballbot_baselines.cautious:cautious_trajopt"),
-    "nmpc-adaptive": called("ballbot_baselines.adaptive:adaptive_nmpc"),
-    "nmpc-ekf": called("ballbot_baselines.adaptive:filtered_nmpc"),
-    "nmpc-adaptive-ekf": called("ballbot_baselines.adaptive:filtered_adaptive_nmpc"),
+    "nmpc-adaptive": partial(_ADAPTIVE, ending="-adaptive"),
+    "nmpc-ekf": partial(_ADAPTIVE, ending="-ekf"),
+    "nmpc-adaptive-ekf": partial(_ADAPTIVE, ending="-adaptive-ekf"),
 }
 """Controllers that run where they are named. They have no row on the leaderboard."""
 

@@ -1,9 +1,9 @@
 """Controllers behind a filter: for robots, delays and sensors that nobody told them.
 
-`TrackFilter` estimates the state, the robot and the delay. A controller acts on the state in which its force will begin to
-act, and asks for what makes up for the share of it that the robot applies. NMPC is told the estimated robot too. Where the
-estimate has moved far from the robot that the episode was planned for, the rest of the episode is planned anew, from the
-present state. That takes longer than a control step.
+`TrackFilter` estimates the state, the robot and the delay, and `SensorFilter` the state of a robot with wheels. A controller
+acts on the state in which its force will begin to act, and asks for what makes up for the share of it that the robot applies.
+NMPC is told the estimated robot too. Where the estimate has moved far from the robot that the episode was planned for, the
+rest of the episode is planned anew, from the present state. That takes longer than a control step.
 
 What friction the floor has is not seen before the robot slips, so plans take the least of the track.
 """
@@ -14,17 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.kalman import FilteredController, TrackFilter
+from ballbot_baselines.kalman import SensorFilter, TrackFilter
 from ballbot_baselines.nmpc import BACKOFF, NmpcController
 from ballbot_baselines.shooting import Backoff
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import TRACKS, Randomization
+from ballbot_gym.randomization import TRACKS
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 
 _MOVED = 0.02  # of a factor of the robot, and at least twice its deviation: then the episode is planned anew
 _NOISY_BACKOFF = Backoff(margin=0.03, goal=0.2, force=0.02, grip=0.1)  # with room for errors of the estimate
-
 
 _TRACKS = {
     "-adaptive-ekf": TRACKS["real"],
@@ -34,19 +33,21 @@ _TRACKS = {
 """What each of `FILTERS` takes for possible."""
 
 
-class BehindTrackFilter:
-    """A controller that acts on what `filter` estimates. It knows what may vary on a track, and how far.
+class FilteredController:
+    """A controller that acts on what `filter` estimates, which is the filter that one of `FILTERS` names.
 
-    It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
+    With wheels "-ekf" makes the state from sensors. Every other filter knows what may vary on a track, and how far. Then it
+    acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, track: Randomization, controller: Controller):
+    def __init__(self, task: Task, params: BallbotParams, ending: str, controller: Controller):
         self._task, self._params, self._controller = task, params, controller
-        self.filter = TrackFilter(task, params, track)
+        self.senses = params.wheels is not None and ending == "-ekf"
+        self.filter = SensorFilter(task, params) if self.senses else TrackFilter(task, params, _TRACKS[ending])
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._start = c, t
-        self.filter.reset(x)
+        self.filter.reset(x, c)
         self._begin(t)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -73,7 +74,7 @@ class BehindTrackFilter:
         return t + self._task.control_dt * self.filter.delay
 
 
-class AdaptiveNmpcController(BehindTrackFilter):
+class AdaptiveNmpcController(FilteredController):
     """NMPC for a track: it estimates what was drawn, and plans with it.
 
     | attribute | meaning |
@@ -82,11 +83,12 @@ class AdaptiveNmpcController(BehindTrackFilter):
     | `plans` | how many plans were made in the episode |
     """
 
+    filter: TrackFilter
     _controller: NmpcController
 
-    def __init__(self, task: Task, params: BallbotParams, track: Randomization, backoff: Backoff = BACKOFF):
-        self._backoff = backoff
-        super().__init__(task, params, track, NmpcController(task, params, backoff=backoff))
+    def __init__(self, task: Task, params: BallbotParams, ending: str):
+        self._backoff = BACKOFF if ending == "-adaptive" else _NOISY_BACKOFF
+        super().__init__(task, params, ending, NmpcController(task, params, backoff=self._backoff))
 
     def _begin(self, t: float) -> None:
         self.plans = 0
@@ -105,25 +107,3 @@ class AdaptiveNmpcController(BehindTrackFilter):
         nmpc = NmpcController(self._task, self.filter.robot, backoff=self._backoff)
         nmpc.reset(self._when_free(t), self.filter.when_free(), self._c)
         self._controller, self.plans = nmpc, self.plans + 1
-
-
-def behind_filter(task: Task, params: BallbotParams, name: str, controller: Controller) -> Controller:
-    """A controller behind the filter that one of `FILTERS` names; with wheels "-ekf" makes the state from sensors."""
-    if params.wheels is not None and name == "-ekf":
-        return FilteredController(task, params, controller)
-    return BehindTrackFilter(task, params, _TRACKS[name], controller)
-
-
-def adaptive_nmpc(task: Task, params: BallbotParams) -> AdaptiveNmpcController:
-    """For the tracks "unknown" and "late", whose sensors are exact."""
-    return AdaptiveNmpcController(task, params, _TRACKS["-adaptive"])
-
-
-def filtered_nmpc(task: Task, params: BallbotParams) -> AdaptiveNmpcController:
-    """For the track "noisy", whose robot is known."""
-    return AdaptiveNmpcController(task, params, _TRACKS["-ekf"], _NOISY_BACKOFF)
-
-
-def filtered_adaptive_nmpc(task: Task, params: BallbotParams) -> AdaptiveNmpcController:
-    """For the track "real", which has all of it."""
-    return AdaptiveNmpcController(task, params, _TRACKS["-adaptive-ekf"], _NOISY_BACKOFF)

@@ -25,7 +25,6 @@ from ballbot_gym import dynamics, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
-from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
 _X, _FACTORS = slice(0, 8), slice(8, 11)
@@ -63,8 +62,8 @@ class TrackFilter:
         self._walk = np.array([0] * 4 + [_MODEL_ERROR] * 4 + [_FACTOR_WALK] * 3 + [0] * 6) ** 2
         self._noise = np.diag(np.maximum(track.noise, _LEAST_NOISE)) ** 2
 
-    def reset(self, x: np.ndarray) -> None:
-        """Starts an episode, of which sensors report state x (8,) at first, or B episodes (B, 8)."""
+    def reset(self, x: np.ndarray, c: np.ndarray | None = None) -> None:
+        """Starts an episode, of which sensors report state x (8,) at first, or B episodes (B, 8); c does not matter."""
         one_for_each = (*x.shape[:-1], len(self._delays))
         calls = -(-int(np.prod(one_for_each)) // LANES)
         count = calls * LANES
@@ -211,7 +210,11 @@ class SensorFilter:
     |---|---|---|
     | `x` | (11,) | the state |
     | `covariance` | (14, 14) | of the state and the gyroscope's biases |
+
+    The robot and its delay are known: `factors` and `delay` are as of a `TrackFilter` that has nothing to estimate.
     """
+
+    factors, delay = np.ones(3), 0
 
     def __init__(self, task: Task, params: BallbotParams):
         self._task, self._params, self._dt = task, params, task.control_dt
@@ -225,8 +228,8 @@ class SensorFilter:
         found, slopes = self._model(self._z[:11], np.zeros(3))
         self._correct(seen, found[11:], slopes[11:, :])
 
-    def update(self, seen: np.ndarray, u: np.ndarray) -> None:
-        """Takes what sensors show (no,) after a control step with the wheels' forces u (3,), N."""
+    def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
+        """Takes what sensors show (no,) at the time t, s, after a control step with the wheels' forces u (3,), N."""
         u = np.clip(u, -self._params.force_limit, self._params.force_limit)
         self._correct(seen, *self._over_step(self._z[:11], u))
         after, slopes = self._after(self._z[:11], u)
@@ -251,26 +254,9 @@ class SensorFilter:
     def covariance(self) -> np.ndarray:
         return self._p.copy()
 
-
-class FilteredController:
-    """A controller behind `SensorFilter`, for envs that show sensors; `filter` is what it knows."""
-
-    senses = True
-
-    def __init__(self, task: Task, params: BallbotParams, controller: Controller):
-        self.filter, self._controller = SensorFilter(task, params), controller
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        """Starts at the episode's time t, s, where sensors show x (no,)."""
-        self.filter.reset(x, c)
-        self._u: np.ndarray | None = None
-        self._controller.reset(t, self.filter.x, c)
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        if self._u is not None:
-            self.filter.update(x, self._u)
-        self._u = np.asarray(self._controller.act(t, self.filter.x))
-        return self._u
+    def when_free(self) -> np.ndarray:
+        """The state (11,) in which the next command will act, which is the present one."""
+        return self.x
 
 
 class StateFromSensors(gymnasium.Wrapper):
@@ -296,8 +282,8 @@ class StateFromSensors(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
         seen, reward, terminated, truncated, info = self.env.step(action)
-        self.filter.update(seen, info["force"])
         self._steps += 1
+        self.filter.update(self._steps * self._task.control_dt, seen, info["force"])
         return self._state(info), reward, terminated, truncated, info
 
     def _state(self, info: dict[str, Any]) -> np.ndarray:

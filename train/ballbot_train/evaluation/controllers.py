@@ -184,9 +184,9 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ending = ending or "-adaptive"
     if not ending:
         return controller
-    from ballbot_baselines.adaptive import behind_filter  # it imports CasADi
+    from ballbot_baselines.adaptive import FilteredController  # it imports CasADi
 
-    return behind_filter(task, params, ending, controller)
+    return FilteredController(task, params, ending, controller)
 
 
 def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:

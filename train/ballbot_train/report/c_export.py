@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from ballbot_baselines import kalman
+from ballbot_baselines.adaptive import FilteredController
 from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym import dynamics, files, sensors
 from ballbot_gym.env import BallbotEnv
@@ -133,7 +134,7 @@ def _test(network: PolicyNetwork, task: Task, robot: str, filtered: bool) -> dic
     params, seen = named_robot(robot), list[np.ndarray]()
     controller: Controller = PolicyController(task, params, network)
     if filtered:
-        controller = kalman.FilteredController(task, params, controller)
+        controller = FilteredController(task, params, "-ekf", controller)
     env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors" if filtered else "state")
     c = rollout(env, controller, seed=0, watch=seen.append).constants.astype(np.float32)
     k = np.arange(_TEST_STEPS) if filtered else np.linspace(0, len(seen) - 1, _TEST_STEPS).astype(int)
