@@ -337,12 +337,12 @@ class _Batch:
                 kept[rows[cheaper]] = values[cheaper]
 
         side = righting.leaning_aside(x0, np.ones(count)).T
-        path = np.zeros((count, n, 8))
+        path = np.zeros((count, n, 4))
         path[..., :2] = self._ends[:, None, :2]
         for family in (_FAMILY, _SIDEWAYS_FAMILY):
             rows = np.flatnonzero(np.isinf(best))
             for bandwidth, seconds, lean, fade in family if len(rows) else ():
-                path[..., 6:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
+                path[..., 2:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
                 improve(rows, np.zeros_like(a), path[rows], (bandwidth, seconds))
         if forces is not None:
             improve(np.arange(count), forces[:, :n] / self._params.force_limit)

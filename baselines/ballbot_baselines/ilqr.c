@@ -252,12 +252,12 @@ void solve(int64_t jobs, int64_t n, int64_t most, const int64_t *rows, const opt
     for (unsigned i = 0; i < sizeof made / sizeof *made; ++i) free(made[i]);
 }
 
-/* Simulates the cascade along paths (jobs, n, 8) with its two settings, or the actions a where there is no path, with feedback
+/* Simulates the cascade along paths (jobs, n, 4) with its two settings, or the actions a where there is no path, with feedback
    where there is one: gains (jobs, 2, STATES), each with the state about which it is. x (jobs, n+1, STATES) has the initial states. */
 void follow(int64_t jobs, int64_t n, const double *lengths, const double *given, const double *path_all,
             const double *settings, const double *feedback, double *x_all, double *a_all, double *costs, double *missed_all) {
     for (int64_t first = 0; first < jobs; first += LANES) {
-        real x[2][STATES][LANES], a[2][LANES], path[8][LANES], p[PARAMS + 1][LANES], set[2][LANES], rate[1][LANES];
+        real x[2][STATES][LANES], a[2][LANES], path[4][LANES], p[PARAMS + 1][LANES], set[2][LANES], rate[1][LANES];
         real dt[1][LANES], g[PATH + 1][LANES], cost[LANES] = {0}, missed[LANES] = {0}, zero[PATH + 3][LANES] = {{0}};
         real lqr[3 * STATES][LANES] = {{0}};
         real one[1][LANES], priced[1][LANES], taken[2][LANES];
@@ -273,7 +273,7 @@ void follow(int64_t jobs, int64_t n, const double *lengths, const double *given,
         for (int64_t t = 0; t < n; ++t) {
             real *now = &x[t & 1][0][0], *after = &x[(t + 1) & 1][0][0];
             if (path_all) {
-                EACH_LANE for (int i = 0; i < 8; ++i) path[i][k] = path_all[(job[k] * n + t) * 8 + i];
+                EACH_LANE for (int i = 0; i < 4; ++i) path[i][k] = path_all[(job[k] * n + t) * 4 + i];
                 steer(now, LANES, AT(path), AT(set), AT(p), AT(a));
             } else
                 EACH_LANE for (int i = 0; i < 2; ++i) a[i][k] = a_all[(job[k] * n + t) * 2 + i];

@@ -205,15 +205,15 @@ class Ilqr:
         settings: tuple[float, float] = (0.0, 0.0),
         ends: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulates J episodes under given actions, in which `righting.steering` follows a path, or under LQR at the end.
+        """Simulates J episodes under given actions, or under `righting.steering`, or under LQR at the end.
 
         Args:
             x0: (J, 8) initial states.
             length: of a step, s.
             given: as of `solve`.
             a: (J, n, 2) actions; 0 with `paths` or `ends`.
-            paths: (J, n, 8) positions, velocities, accelerations, and leans that are added; SI units.
-            settings: of the feedback along paths, its bandwidth, rad/s, and its time constant, s.
+            paths: (J, n, 4) where to steer the ball, m, and leans that are added, rad.
+            settings: of this feedback, its bandwidth, rad/s, and its time constant, s.
             ends: (J, 8) states about which LQR acts.
 
         Returns:
@@ -258,18 +258,21 @@ class _Stage:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
     def __init__(self, task: Task, kind: RobotKind, free_time: bool, rests: bool):
-        self._ocp = ocp_of(task, kind)
+        self._ocp = ocp_of(task, kind, free_time)
         self._substeps = dynamics.substeps_for(task.control_dt)
         self._free, self.ns, self._rests = free_time, 9 if free_time else 8, rests
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
         self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
-        self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
+        self._all = casadi.vertcat(self._x[8] if free_time else self._dt, self._p[: self._ocp.params - 1])
         self._limit: Any
         self._robot, self._limit = kind.symbolic(self._all)
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
-        path, end = self._path(self._a), self._ocp.final_inequalities(self._x[:8], self._all)
+        path, end = (
+            self._ocp.inequalities(self._x, self._a, self._all),
+            self._ocp.final_inequalities(self._x, self._all),
+        )
         self._multipliers, self._end_multipliers = symbol("m", path.shape[0]), symbol("e", end.shape[0])
         self._upper = [(i, j) for i in range(self.ns) for j in range(i, self.ns)]
         self.sizes = {
@@ -288,19 +291,8 @@ class _Stage:
         blocks = [self._sweep(), self._end(), self._hold(), self._bend(), self._steer()]
         return "\n".join([*defined, codegen.text("real.h"), *blocks, own])
 
-    def _length(self, x: casadi.SX) -> casadi.SX:
-        return x[8] if self._free else self._dt
-
     def _after(self, x: casadi.SX, a: casadi.SX, substeps: int) -> casadi.SX:
-        length = self._length(x)
-        after = dynamics.step(self._robot, x[:8], self._limit * a, length, substeps)
-        return casadi.vertcat(after, length) if self._free else after
-
-    def _path(self, a: casadi.SX) -> casadi.SX:
-        return self._ocp.inequalities(self._x[:8], a, self._all)
-
-    def _rate(self, a: casadi.SX) -> casadi.SX:
-        return self._ocp.cost(self._x[:8], a, self._all)
+        return casadi.vertcat(dynamics.step(self._robot, x[:8], self._limit * a, self._all[0], substeps), x[8:])
 
     def _sweep(self) -> str:
         """One control step of the Riccati recursion.
@@ -312,7 +304,11 @@ class _Stage:
         z, squares = casadi.vertcat(x, a), len(self._upper)
         ahead = casadi.SX.sym("ahead", squares + ns + 1)
         damping, open_ = casadi.SX.sym("damping"), casadi.SX.sym("open")
-        reached, cost, limits = self._after(x, a, _SUBSTEPS), self._rate(a), self._path(a)
+        reached, cost, limits = (
+            self._after(x, a, _SUBSTEPS),
+            self._ocp.cost(x, a, self._all),
+            self._ocp.inequalities(x, a, self._all),
+        )
         linear, of_limits = casadi.jacobian(reached, z), casadi.jacobian(limits, z)
         push, stiffness = _price_slopes(limits, self._multipliers, self._width)
         value = casadi.SX(ns, ns)
@@ -345,7 +341,7 @@ class _Stage:
     def _end(self) -> str:
         """The cost of the last state, with what is ahead of the last step, and its constraints."""
         x, p = self._x, self._all
-        limits, cost = self._ocp.final_inequalities(x[:8], p), self._ocp.final_cost(x[:8], p)
+        limits, cost = self._ocp.final_inequalities(x, p), self._ocp.final_cost(x, p)
         if self._rests:
             end, squares, share = casadi.vertsplit(self._p[-_REST:], [0, 8, _REST - 1, _REST])
             upper = casadi.SX(casadi.Sparsity.upper(8).T, squares).T
@@ -364,7 +360,7 @@ class _Stage:
         about = casadi.SX.sym("about", self.ns)
         wanted = self._a + self._share * self._step - self._feedback(self._x - about)
         taken = casadi.vertcat(*(_clipped(wanted[i]) for i in range(2)))
-        limits = self._path(taken)
+        limits, cost = self._ocp.inequalities(self._x, taken, self._all), self._ocp.cost(self._x, taken, self._all)
         price = casadi.sum1(_price(limits, self._multipliers, self._width))
         return _block(
             "hold",
@@ -380,7 +376,7 @@ class _Stage:
                 self._multipliers,
                 self._width,
             ),
-            (self._after(self._x, taken, self._substeps), taken, self._rate(taken), limits, price),
+            (self._after(self._x, taken, self._substeps), taken, cost, limits, price),
         )
 
     def _bend(self) -> str:
@@ -396,12 +392,11 @@ class _Stage:
         )
 
     def _steer(self) -> str:
-        """The action of `righting.steering` along a path."""
-        path, settings = casadi.SX.sym("path", 8), casadi.SX.sym("settings", 2)
-        target, velocity, acceleration, aside = (tuple(casadi.vertsplit(path[i : i + 2])) for i in (0, 2, 4, 6))
+        """The action of `righting.steering`."""
+        path, settings = casadi.SX.sym("path", 4), casadi.SX.sym("settings", 2)
+        target, aside = (tuple(casadi.vertsplit(part)) for part in (path[:2], path[2:]))
         limit, x = self._limit, tuple(casadi.vertsplit(self._x[:8]))
-        loops = settings[0], settings[1]
-        force = righting.steering(self._robot, x, aside, *loops, target, limit, velocity, acceleration)
+        force = righting.steering(self._robot, x, aside, settings[0], settings[1], target, limit)
         return _block("steer", (self._x, path, settings, self._p), (casadi.vertcat(*force) / limit,))
 
     def _feedback(self, off: casadi.SX) -> casadi.SX:

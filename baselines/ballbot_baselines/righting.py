@@ -148,8 +148,6 @@ def steering(
     seconds: Any,
     target: Vector,
     force: float,
-    velocity: Vector = (0.0, 0.0),
-    acceleration: Vector = (0.0, 0.0),
 ) -> tuple[Any, ...]:
     """The cascade's force (Fx, Fy), N, for floats, arrays, tensors and symbols: components of one shape.
 
@@ -160,8 +158,6 @@ def steering(
         seconds: time constant of the ball's loop, s.
         target: 2 components of where to steer the ball, m.
         force: largest force per axis, N.
-        velocity: 2 components of the target's velocity, m/s.
-        acceleration: the same of its acceleration, m/s².
     """
     h, mass = params.first_moment, params.moving_mass
     inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
@@ -169,8 +165,7 @@ def steering(
     forces = []
     for axis in range(2):
         position, lean, speed, rate = x[axis] - target[axis], x[2 + axis], x[4 + axis], x[6 + axis]
-        wanted = acceleration[axis] - 2 / seconds * (speed - velocity[axis]) - position / seconds**2
-        wanted = ops.arctan(wanted / params.gravity)
+        wanted = ops.arctan((-2 / seconds * speed - position / seconds**2) / params.gravity)
         wanted = ops.clip(wanted, -_LARGEST_LEAN, _LARGEST_LEAN) + aside[axis]
         turn = -(bandwidth**2) * (lean - wanted) - 2 * bandwidth * rate
         # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
