@@ -4,7 +4,6 @@ The horizon's intervals are whole numbers of control steps. The first is one ste
 Where there are more control steps than nodes, the later intervals hold theirs longer.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi
@@ -26,35 +25,26 @@ _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions 
 _QP_ITERATIONS = 30
 
 
-@dataclass(frozen=True)
-class Grid:
-    """The horizon in control steps: node j lies `offsets[j]` after now, (N+1,); interval j is `lengths[j]` long, (N,)."""
+def grid(steps: int, nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`nodes` intervals N over a number of control steps: the first one step, the rest as equal as can be.
 
-    lengths: np.ndarray
-    offsets: np.ndarray
+    Returns:
+        How many control steps after now the nodes lie, (N+1,). What takes values at the nodes to the values one control step
+        later, linear between and constant beyond, (N+1, N+1). What takes values held over the intervals to their means one
+        control step later, 0 beyond the end, (N, N).
 
-    @classmethod
-    def make(cls, steps: int, nodes: int) -> "Grid":
-        """`nodes` intervals over a number of control steps: the first one step, the rest as equal as can be.
-
-        Raises:
-            ValueError: fewer than 2 nodes, or fewer control steps than nodes.
-        """
-        if not 2 <= nodes <= steps:
-            raise ValueError(f"a horizon of {steps} control steps takes 2 to {steps} nodes, not {nodes}")
-        base, longer = divmod(steps - 1, nodes - 1)
-        lengths = np.array([1] + [base] * (nodes - 1 - longer) + [base + 1] * longer)
-        return cls(lengths, np.concatenate([[0], np.cumsum(lengths)]))
-
-    def shift_states(self) -> np.ndarray:
-        """(N+1, N+1) takes values at the nodes to the values one control step later, linear between, constant beyond."""
-        return np.array([np.interp(self.offsets + 1, self.offsets, unit) for unit in np.eye(len(self.offsets))]).T
-
-    def shift_inputs(self) -> np.ndarray:
-        """(N, N) takes values held over the intervals to their means one control step later; beyond the end they are 0."""
-        held = np.repeat(np.eye(len(self.lengths)), self.lengths, axis=0)  # (steps, N)
-        later = np.vstack([held[1:], np.zeros((1, len(self.lengths)))])
-        return np.add.reduceat(later, self.offsets[:-1], axis=0) / self.lengths[:, None]
+    Raises:
+        ValueError: fewer than 2 nodes, or fewer control steps than nodes.
+    """
+    if not 2 <= nodes <= steps:
+        raise ValueError(f"a horizon of {steps} control steps takes 2 to {steps} nodes, not {nodes}")
+    base, longer = divmod(steps - 1, nodes - 1)
+    lengths = np.array([1] + [base] * (nodes - 1 - longer) + [base + 1] * longer)
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    of_states = np.array([np.interp(offsets + 1, offsets, unit) for unit in np.eye(nodes + 1)]).T
+    held = np.repeat(np.eye(nodes), lengths, axis=0)  # (steps, N)
+    later = np.vstack([held[1:], np.zeros((1, nodes))])
+    return offsets, of_states, np.add.reduceat(later, offsets[:-1], axis=0) / lengths[:, None]
 
 
 class _Pattern:

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.horizon import Grid, horizon_qp
+from ballbot_baselines.horizon import grid, horizon_qp
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Optimum, plan_to_track
 from ballbot_baselines.shooting import Backoff, RobotKind
@@ -104,9 +104,9 @@ class NmpcController:
         steps = round(horizon / task.control_dt)
         if steps < 0 or abs(steps * task.control_dt - horizon) > 1e-9:
             raise ValueError(f"horizon must be a whole number of control steps of {task.control_dt} s, not {horizon} s")
-        self._grid = Grid.make(steps, min(nodes or (steps if params.grips else _NODES), steps))
-        self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
-        self._qp = horizon_qp(task, RobotKind.of(params), len(self._grid.lengths))
+        nodes = min(nodes or (steps if params.grips else _NODES), steps)
+        self._offsets, self._shift_states, self._shift_inputs = grid(steps, nodes)
+        self._qp = horizon_qp(task, RobotKind.of(params), nodes)
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
         self.disturbance: DisturbanceEstimator | None = None
@@ -145,7 +145,7 @@ class NmpcController:
         self._sums = np.concatenate([np.zeros((1, robot.action_size)), sums])
         margins = np.array([task.margins(x, task.at(c, t)) for t, x in zip(trajectory.t, trajectory.x, strict=True)])
         self._distinct = np.unique(margins, axis=1, return_index=True)[1]  # unused obstacles repeat others
-        nodes = len(self._grid.lengths)
+        nodes = len(self._shift_inputs)
         self._dx, self._da = np.zeros((nodes + 1, robot.state_size)), np.zeros((nodes, robot.action_size))
         self._curvature = np.zeros(nodes)
         self._reserve = self._reserve_of_grip()
@@ -202,7 +202,7 @@ class NmpcController:
         passed = self._curvature[elapsed - self._step :]
         self._curvature = np.concatenate([passed, np.zeros(len(self._curvature) - len(passed))])
         self._step = elapsed
-        self._nodes = at = np.minimum(elapsed + self._grid.offsets, self._length)
+        self._nodes = at = np.minimum(elapsed + self._offsets, self._length)
         self._lengths = np.diff(at)  # near the plan's end intervals shrink to nothing
         sums = self._sums
         self._x_plan = self._trajectory.x[at]

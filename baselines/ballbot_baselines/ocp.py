@@ -129,7 +129,7 @@ class OcpSolution:
 
     `success` means that the solver met its tolerance; ipopt's "Solved_To_Acceptable_Level" does not. `states` is (N+1, ns)
     and `inputs` is (N, nw). `violation` is the largest amount by which a constraint or bound is missed, in the constraint's
-    unit. `seconds` is the wall time of this solve. `costates` (N, ns) are the multipliers of the dynamics: row k is the
+    unit. `costates` (N, ns) are the multipliers of the dynamics: row k is the
     slope, with respect to s_{k+1}, of the optimal cost from stage k+1 on.
     """
 
@@ -140,7 +140,6 @@ class OcpSolution:
     inputs: np.ndarray
     violation: float
     iterations: int
-    seconds: float
     solver: str
     costates: np.ndarray
 
@@ -248,8 +247,7 @@ class OcpSolver:
             lbg=self._g_lower,
             ubg=self._g_upper,
         )
-        seconds = time.perf_counter() - start
-        spent.solving += seconds
+        spent.solving += time.perf_counter() - start
         stats = self._nlpsol.stats()
         status = _status(self.solver, stats)
         z = np.array(result["x"]).ravel()
@@ -267,7 +265,6 @@ class OcpSolver:
             inputs=inputs,
             violation=float(violation),
             iterations=int(stats["iter_count"]),
-            seconds=seconds,
             solver=self.solver,
             # Gaps are s_{k+1} − next_k, and the cost's slope with respect to their right-hand side is minus the multiplier.
             costates=-np.array(result["lam_g"]).ravel()[self._gaps],

@@ -184,7 +184,6 @@ def _simulated(episode: Shooting, member: righting.Member) -> OcpSolution:
         inputs=member.u / params.force_limit,
         violation=max(0.0, -min(float(np.min(part)) for part in room)),
         iterations=0,
-        seconds=0.0,
         solver="simulation",
         costates=np.zeros((len(member.u), params.state_size)),
     )

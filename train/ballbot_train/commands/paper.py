@@ -29,12 +29,12 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
     rows = []
     for name in only or PAPER_PROBLEMS:
         entry = PAPER_PROBLEMS[name]
-        tracked = track_plan(entry.solve(params), params)
-        plan = tracked.plan
+        plan = entry.solve(params)
+        executed, error = track_plan(plan, params)
         plan.trajectory.save(out / f"{name}.npz")
         takes = [
             figures.Take("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", style="--"),
-            figures.Take(f"{simulator} under TVLQR", tracked.executed, labels.color("trajopt")),
+            figures.Take(f"{simulator} under TVLQR", executed, labels.color("trajopt")),
         ]
         figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", takes, _paper_markers(entry, plan))
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
@@ -48,7 +48,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
                 "peak lean, deg": f"{tilt:.2f}",
                 "peak force, N": f"{np.abs(plan.trajectory.u).max():.0f}",
                 "collocation error": f"{plan.collocation_error:.1e}",
-                "tracked within, cm": f"{100 * tracked.error:.1f}",
+                "tracked within, cm": f"{100 * error:.1f}",
                 "status": plan.status,
             }
         )
@@ -65,15 +65,15 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
     for name in names:
         entry = PAPER_PROBLEMS[name]
         takes = []
-        for run in compare_stabilization(entry):
-            episode, rate = run.episode, f"{run.rate:.0f} Hz"
-            label = f"{labels.label(run.controller)}, {rate}"
-            takes.append(figures.Take(label, episode.trajectory, labels.color(run.controller)))
+        for controller, episode in compare_stabilization(entry).items():
+            rate = f"{len(episode.trajectory.u) / episode.trajectory.duration:.0f} Hz"
+            label = f"{labels.label(controller)}, {rate}"
+            takes.append(figures.Take(label, episode.trajectory, labels.color(controller)))
             peak = math.degrees(np.abs(episode.trajectory.x[:, 2:4]).max())
             rows.append(
                 {
                     "figure": entry.figure,
-                    "controller": run.controller,
+                    "controller": controller,
                     "feedback": rate,
                     "cost": f"{episode.cost:.2f}",
                     "peak lean, deg": f"{peak:.1f}",
