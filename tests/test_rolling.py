@@ -298,7 +298,7 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
             raise PlanError("it cannot but slip")
         t = np.array([0.0, 0.02])
         return SimpleNamespace(
-            cost=1.0, violation=0.0, solver="fatrop", solver_status="fine", is_optimal=True, tried=1, next_basin=0.1,
+            cost=1.0, violation=0.0, solver="fatrop", solver_status="fine", is_optimal=True,
             trajectory=Trajectory(t, np.array([x, x]), np.zeros((1, 2))),
         )  # fmt: skip
 

@@ -4,8 +4,6 @@
 """
 
 import itertools
-import json
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -86,15 +84,13 @@ def _solved(
     optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn, twice)
     if drawn and drawn[5] > 0:
         ideal = _optimal(task, randomization.robot(params, drawn), x0, c, twice=True)
-    next_basin = None if math.isnan(optimum.next_basin) else optimum.next_basin
-    found = json.dumps({"tried": optimum.tried, "next_basin": next_basin})
     return EvaluationSet(
         states=np.array([x0]),
         constants=np.array([c]),
         costs=np.array([optimum.cost]),
         durations=np.array([task.control_dt * len(optimum.trajectory.u)]),
         violations=np.array([optimum.violation]),
-        statuses=np.array([f"{optimum.solver}: {optimum.solver_status}; {found}"]),
+        statuses=np.array([f"{optimum.solver}: {optimum.solver_status}"]),
         trajectories=(optimum.trajectory,),
         drawn=np.array([drawn]),
         ideal=np.array([ideal.cost]),

@@ -33,7 +33,6 @@ _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest fi
 FROM_BATCH = -2
 """The `guess` of an optimum that `batched.find_optima` found."""
 _NO_CHEAPER = 1e-6  # relative
-_SAME_BASIN = 1e-4  # solutions whose costs differ by less are one local optimum
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
 
@@ -49,8 +48,6 @@ class Optimum(Moving):
     | `guess` | index of the guessed path that led to it, `FROM_RIGHTING` or `FROM_BATCH` |
     | `seconds` | wall time of the whole search |
     | `solver_seconds`, `setup_seconds` | the parts of it in solvers, and on differentiating and compiling |
-    | `tried` | how many of the guesses were tried |
-    | `next_basin` | by which share the next best local optimum costs more, on the grid that compared them, or NaN |
     | `costates` | (n, 8) slopes of the remaining cost with respect to x_1 … x_n; 0 for a simulated episode |
     | `markers` | what the task draws |
     """
@@ -67,8 +64,6 @@ class Optimum(Moving):
     solver_seconds: float
     setup_seconds: float
     costates: np.ndarray
-    tried: int = 1
-    next_basin: float = math.nan
     markers: tuple[Marker, ...] = ()
 
     def facts(self) -> dict[str, str]:
@@ -145,8 +140,6 @@ def find_optimum(
         solver_seconds=spent.solving - before[0],
         setup_seconds=spent.setup - before[1],
         costates=solution.costates,
-        tried=len({i for i, _ in tried} | set(episode.compared)),
-        next_basin=_next_basin(best, tried, episode.compared),
         markers=tuple(task.markers(c)),
     )
 
@@ -166,14 +159,6 @@ def _cheaper(episode: Shooting, found: batched.BatchOptima | None, cost: float) 
     return [
         (FROM_BATCH, solution) for solution in episode.solve_to_the_end(x, u / episode.params.force_limit, near=True)
     ]
-
-
-def _next_basin(best: Found, tried: list[Found], compared: dict[int, float]) -> float:
-    """By which share the next best local optimum costs more than the best; NaN where no other was found."""
-    costs = compared if best[0] in compared else {}
-    costs = costs or {i: solution.cost for i, solution in reversed(tried) if solution.is_optimal}
-    own = costs.get(best[0], math.nan)
-    return min((cost / own - 1 for cost in costs.values() if cost > own * (1 + _SAME_BASIN)), default=math.nan)
 
 
 def _rank(tried: Found) -> tuple[bool, float]:

@@ -103,7 +103,6 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
             h = (len(path) - 1) * task.control_dt / FREE_TIME_INTERVALS
             tried.append((i, episode.relaxed(*episode.along(guess.resampled(path, FREE_TIME_INTERVALS), h), h)))
         found = [t for t in tried if not t[1].is_optimal]
-        _note(episode, tried)
         for i, relaxed in _distinct([t for t in tried if t[1].is_optimal], BASIN_DOUBT):
             found += [(i, solution) for solution in episode.in_whole_steps(relaxed)]
         return found
@@ -116,17 +115,9 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
 
 def _refined(episode: Shooting, coarse: list[Found], doubt: float, paths: list[np.ndarray]) -> list[Found]:
     """Solves from the coarse solutions within a relative `doubt` of the best; along the paths, if there are none."""
-    _note(episode, coarse)
     near = [(i, _on_grid(solution, episode.task.steps)) for i, solution in _distinct(coarse, doubt)]
     starts = near or [(i, episode.along(path)) for i, path in enumerate(paths)]
     return [(i, s) for i, (x, a) in starts for s in episode.solve_to_the_end(x, a, near=bool(near))]
-
-
-def _note(episode: Shooting, solved: list[Found]) -> None:
-    """Remembers what guesses cost that are only compared; the first grid that compares a guess counts."""
-    for index, solution in solved:
-        if solution.is_optimal:
-            episode.compared.setdefault(index, solution.cost)
 
 
 def _on_grid(solution: OcpSolution, steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +220,6 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
             if solution.success:
                 solved.append((i, solution))
                 break
-    _note(episode, solved)
     if coarsest > COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
         solved = _on_coarse_grid(episode, _distinct(solved, _COARSEST_DOUBT)) or solved
     return _refined(episode, solved, grid_doubt, paths[:most])

@@ -8,7 +8,7 @@ Solvers see actions, which are forces divided by their limit.
 """
 
 import math
-from dataclasses import asdict, astuple, dataclass, field, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -214,8 +214,6 @@ class Shooting:
     backoff: Backoff
     start: float = 0.0
     """The episode's time at x0, s."""
-    compared: dict[int, float] = field(default_factory=dict)
-    """What guesses cost, by their index, that were solved on a coarser grid, or with free time, to choose among them."""
 
     def along(self, path: np.ndarray, length: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """A guess that roughly follows a ground path (n+1, 2), m, one point every `length` s; default, the control step."""
