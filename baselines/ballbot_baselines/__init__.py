@@ -34,7 +34,7 @@ CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 _ADAPTIVE = called("ballbot_baselines.adaptive:AdaptiveNmpcController")
 VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
     "nmpc-offset-free": called("ballbot_baselines.nmpc:offset_free_nmpc"),
-    "cautious": called("ballbot_baselines.cautious:cautious_trajopt"),
+    "cautious": called("ballbot_baselines.trajopt:cautious_trajopt"),
     "nmpc-adaptive": partial(_ADAPTIVE, ending="-adaptive"),
     "nmpc-ekf": partial(_ADAPTIVE, ending="-ekf"),
     "nmpc-adaptive-ekf": partial(_ADAPTIVE, ending="-adaptive-ekf"),

@@ -75,13 +75,7 @@ class FilteredController:
 
 
 class AdaptiveNmpcController(FilteredController):
-    """NMPC for a track: it estimates what was drawn, and plans with it.
-
-    | attribute | meaning |
-    |---|---|
-    | `filter` | the estimate |
-    | `plans` | how many plans were made in the episode |
-    """
+    """NMPC for a track: `filter` estimates what was drawn, and it plans with that."""
 
     filter: TrackFilter
     _controller: NmpcController
@@ -91,7 +85,6 @@ class AdaptiveNmpcController(FilteredController):
         super().__init__(task, params, ending, NmpcController(task, params, backoff=self._backoff))
 
     def _begin(self, t: float) -> None:
-        self.plans = 0
         self._plan(t)
 
     def _adapt(self, t: float) -> None:
@@ -106,4 +99,4 @@ class AdaptiveNmpcController(FilteredController):
         self._factors, self._delay = self.filter.factors, self.filter.delay
         nmpc = NmpcController(self._task, self.filter.robot, backoff=self._backoff)
         nmpc.reset(self._when_free(t), self.filter.when_free(), self._c)
-        self._controller, self.plans = nmpc, self.plans + 1
+        self._controller = nmpc

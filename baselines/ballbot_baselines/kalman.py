@@ -204,12 +204,7 @@ def expected_start(task: Task, params: BallbotParams, c: np.ndarray) -> tuple[np
 
 
 class SensorFilter:
-    """Estimates the state of a robot with wheels from its sensors and the forces of its wheels.
-
-    | attribute | shape | meaning |
-    |---|---|---|
-    | `x` | (11,) | the state |
-    | `covariance` | (14, 14) | of the state and the gyroscope's biases |
+    """Estimates the state `x` (11,) of a robot with wheels from its sensors and the forces of its wheels.
 
     The robot and its delay are known: `factors` and `delay` are as of a `TrackFilter` that has nothing to estimate.
     """
@@ -249,10 +244,6 @@ class SensorFilter:
     @property
     def x(self) -> np.ndarray:
         return self._z[:11].copy()
-
-    @property
-    def covariance(self) -> np.ndarray:
-        return self._p.copy()
 
     def when_free(self) -> np.ndarray:
         """The state (11,) in which the next command will act, which is the present one."""

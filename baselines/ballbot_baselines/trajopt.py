@@ -1,16 +1,23 @@
 """Trajectory optimization as a controller: plan at reset, track with TVLQR."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ballbot_baselines.optimum import Optimum, plan_to_track
 from ballbot_baselines.shooting import Backoff
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import TRACKS
 from ballbot_gym.tasks import Task
 
 EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02, grip=0.1)
 """How far plans for execution stay from their limits: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the
 force, a tenth of the weight in normal force, where friction is limited."""
+
+_LEAST_FORCE, _LEAST_FRICTION = TRACKS["unknown"].force[0], TRACKS["unknown"].friction[0]
+# A robot that differs from the model misses its plan: half of the goal's tolerance and 3 cm are left for that.
+_CAUTIOUS = Backoff(margin=0.03, goal=0.5, force=1 - _LEAST_FORCE, grip=0.1)
 
 
 class TrajoptController:
@@ -31,3 +38,11 @@ class TrajoptController:
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         return self._tracker.act(t, x)
+
+
+def cautious_trajopt(task: Task, params: BallbotParams) -> TrajoptController:
+    """`TrajoptController` for the nominal robot with the least force and friction of the track "unknown".
+
+    Its plans leave force and room for feedback on all robots of that track.
+    """
+    return TrajoptController(task, replace(params, friction=params.friction * _LEAST_FRICTION), _CAUTIOUS)
