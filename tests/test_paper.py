@@ -7,7 +7,15 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, state, straight_guess
+from ballbot_baselines.paper_problems import (
+    PAPER_PROBLEMS,
+    TRACKING_DT,
+    between_states,
+    compare_stabilization,
+    state,
+    straight_guess,
+    track_plan,
+)
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
@@ -195,8 +203,6 @@ def test_guess_along_an_accelerating_path_is_the_motion_itself(params):
 
 def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
     pytest.importorskip("pybullet")
-    from ballbot_baselines.paper_experiments import TRACKING_DT, track_plan
-
     plan = plan_of("stabilize-1")
     executed, error = track_plan(plan, params)
     assert error < 0.01  # measured: 1 mm
@@ -205,8 +211,6 @@ def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
 
 def test_lqr_and_trajectory_optimization_start_where_the_papers_problem_starts():
     pytest.importorskip("pybullet")
-    from ballbot_baselines.paper_experiments import compare_stabilization
-
     entry = PAPER_PROBLEMS["stabilize-1"]
     episodes = compare_stabilization(entry)
     steps = {name: np.diff(episode.trajectory.t) for name, episode in episodes.items()}

@@ -1,7 +1,8 @@
 """The paper's three optimizations and the problems of its figures, with the weights for which reference optima are known.
 
 "High lean angle trajectory optimization for ball balancing robots", equations (2) to (4): direct collocation with a free
-time step, costs summed over knots and not multiplied by the step, and a final-time cost S·h·N in every summand.
+time step, costs summed over knots and not multiplied by the step, and a final-time cost S·h·N in every summand. The paper's
+experiments follow in simulation: its plans under feedback, and LQR beside trajectory optimization.
 """
 
 from collections.abc import Callable
@@ -10,13 +11,18 @@ from functools import partial
 
 import numpy as np
 
+from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.collocation import Guess, Plan, Problem, solve
 from ballbot_baselines.guess import along_path
+from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import ops
+from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic
+from ballbot_gym.rollout import Episode, rollout, simulate
 from ballbot_gym.tasks.orbit import steady_orbit
+from ballbot_gym.trajectory import Trajectory
 
 DISTANCE_WEIGHT = 1.0  # Q0, of the squared ground distance from the destination
 REST_WEIGHT = 0.1  # Q1, of the other squared states
@@ -27,6 +33,11 @@ LEAN_LIMIT = 1.0  # rad
 
 INTERVALS = 40
 WEAVE_INTERVALS = 80  # obstacles bind at knots only: with 40 the path cuts 3 cm into them between knots
+
+TRACKING_DT = 0.01
+"""Control step at which the paper's plans are tracked, s."""
+LQR_DT = 0.001
+"""Control step of the paper's LQR, s. The paper's LQR is continuous."""
 
 
 @dataclass(frozen=True)
@@ -204,3 +215,34 @@ PAPER_PROBLEMS: dict[str, PaperProblem] = {
     )
 }
 """The paper's experiments by name."""
+
+
+def track_plan(plan: Plan, params: BallbotParams) -> tuple[Trajectory, float]:
+    """A plan's execution under TVLQR, in PyBullet where it is installed, with the weights of the paper's cost.
+
+    Returns:
+        What was executed, and the largest distance between its path and the plan's, m.
+    """
+    trajectory, dt = plan.trajectory, TRACKING_DT
+    state_weights = np.diag([DISTANCE_WEIGHT, DISTANCE_WEIGHT, *[REST_WEIGHT] * 6])
+    controller = TvlqrController.for_weights(params, trajectory, dt, state_weights, EFFORT_WEIGHT * np.eye(2))
+    executed = simulate(controller, params, trajectory.x[0], round(trajectory.duration / dt) * dt, dt)
+    planned = np.array([trajectory.state(t) for t in executed.t])
+    return executed, float(np.hypot(*(executed.x - planned)[:, :2].T).max())
+
+
+def compare_stabilization(entry: PaperProblem) -> dict[str, Episode]:
+    """Episodes of LQR and of trajectory optimization in PyBullet, both with Stabilize's weights, as in the paper's Figs 2, 3.
+
+    They start from the initial state of the paper's problem.
+    """
+    envs = {
+        "lqr": BallbotEnv("stabilize", control_dt=LQR_DT, physics_dt=LQR_DT / 4),
+        "trajopt": BallbotEnv("stabilize"),
+    }
+    episodes = {}
+    for name, env in envs.items():
+        controller = CONTROLLERS[name](env.task, env.params)
+        episodes[name] = rollout(env, controller, options={"state": entry.problem.initial[0]})
+        env.close()
+    return episodes

@@ -6,8 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_baselines.collocation import Plan
-from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilization, track_plan
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS, PaperProblem
+from ballbot_baselines.paper_problems import (
+    PAPER_PROBLEMS,
+    TRACKING_DT,
+    PaperProblem,
+    compare_stabilization,
+    track_plan,
+)
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks.marker import Marker
