@@ -24,6 +24,7 @@ Constraints g, in the order that fatrop needs:
 """
 
 import itertools
+from typing import NamedTuple
 
 import casadi
 import numpy as np
@@ -119,25 +120,30 @@ class RatesStage(Stage):
         self.jacobian_at, self.hessian_at = (casadi.Sparsity.dense(rows, width) for rows in (n, width))
 
 
+class Stages(NamedTuple):
+    """What a program of any horizon is made of; see `ocp.Ocp`."""
+
+    dynamics: Stage
+    """Next state of [s, w]."""
+    running: Stage
+    """[cost, equalities, inequalities] of [s, w]."""
+    final: Stage
+    """The same of the end, of s."""
+    equalities: int
+    final_equalities: int
+    params: int
+    """Length of p."""
+    initial_matrix: np.ndarray
+
+
 class StagedNlp:
     """The nonlinear program of N intervals as CasADi expressions of z, p and the multipliers lam_f and lam_g.
 
-    `gaps` (N, ns) are the rows of g that say that stages follow each other.
+    `gaps` (N, ns) are the rows of g that say that stages follow each other. `equal` says which rows are 0, and not ≥ 0.
     """
 
-    def __init__(
-        self, dynamics: Stage, running: Stage, final: Stage, intervals: int, params: int, initial_matrix: np.ndarray
-    ):
-        """Makes the symbols.
-
-        Args:
-            dynamics: next state of [s, w].
-            running: [cost, path] of [s, w].
-            final: [final_cost, final_path] of s.
-            intervals: N.
-            params: length of p.
-            initial_matrix: (mo, ns).
-        """
+    def __init__(self, stages: Stages, intervals: int):
+        dynamics, running, final, equalities, final_equalities, params, initial_matrix = stages
         self._dynamics, self._running, self._final, self._initial = dynamics, running, final, casadi.DM(initial_matrix)
         self._n, self._states, self._width = n, states, width = intervals, dynamics.size, dynamics.width
         # Results stand kind by kind: gaps of all stages, [cost, path] of all stages and of the end, and initial rows. Those
@@ -147,6 +153,8 @@ class StagedNlp:
         gaps, of_stages, of_end, of_start = np.split(np.arange(sum(sizes)), self._parts[1:-1])
         first, *others = np.hstack([gaps.reshape(n, states), of_stages.reshape(n, -1)[:, 1:]])
         order = np.concatenate([first, of_start, *others, of_end[1:]])
+        is_path = np.tile(np.arange(running.size) > equalities, n), np.arange(final.size) > final_equalities
+        self.equal = ~np.concatenate([np.zeros(n * states, bool), *is_path, np.zeros(len(initial_matrix), bool)])[order]
         self._order, self._costs = order.tolist(), [*of_stages[:: running.size].tolist(), int(of_end[0])]
         self._place = np.full(sum(sizes), len(order))  # of each result in [g, f]
         self._place[order] = np.arange(len(order))

@@ -20,7 +20,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines.compiled import LONG, SIMD
-from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp
+from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp, Stages
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
@@ -75,7 +75,7 @@ class Ocp:
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
 
     @functools.cached_property
-    def stages(self) -> "Stages":
+    def stages(self) -> Stages:
         """The stage functions with their derivatives, made once for solvers of every horizon."""
         params = self.params + self.counts_stages
         s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", self.states), ("w", self.inputs), ("p", params)))
@@ -93,18 +93,9 @@ class Ocp:
             final=Stage(f"{self.name}-final", s, p, casadi.densify(final_costs), of_stages=False),
             equalities=equal.shape[0],
             final_equalities=final_equal.shape[0],
+            params=self.params,
+            initial_matrix=np.zeros((0, self.states)) if self.initial_matrix is None else self.initial_matrix,
         )
-
-
-@dataclass(frozen=True)
-class Stages:
-    """Next state; [cost, equalities, inequalities] of a stage and of the end; and how many are equalities."""
-
-    dynamics: Stage
-    running: Stage
-    final: Stage
-    equalities: int
-    final_equalities: int
 
 
 @dataclass(frozen=True)
@@ -194,13 +185,8 @@ class OcpSolver:
         self.ocp, self.intervals, self.solver = ocp, intervals, solver
         stages = ocp.stages
         paths, finals = stages.running.size - 1, stages.final.size - 1
-        initial_matrix = np.zeros((0, ocp.states)) if ocp.initial_matrix is None else ocp.initial_matrix
-        initials = len(initial_matrix)
-        of_stage = _equality(ocp.states + stages.equalities, ocp.states + paths)
-        of_end = _equality(stages.final_equalities, finals)
-        equality = of_stage + [True] * initials + of_stage * (intervals - 1) + of_end
-        self._g_lower, self._g_upper = np.zeros(len(equality)), np.where(equality, 0.0, np.inf)
-        nlp = StagedNlp(stages.dynamics, stages.running, stages.final, intervals, ocp.params, initial_matrix)
+        nlp = StagedNlp(stages, intervals)
+        self._g_lower, self._g_upper = np.zeros(len(nlp.equal)), np.where(nlp.equal, 0.0, np.inf)
         oracle, derivatives, for_ipopt = nlp.functions()
         self._gaps = nlp.gaps
         options: dict = {"print_time": False, "error_on_fail": False, "calc_lam_p": False, "cache": derivatives}
@@ -211,8 +197,8 @@ class OcpSolver:
                 "N": intervals,
                 "nx": [ocp.states] * (intervals + 1),
                 "nu": [ocp.inputs] * intervals + [0],
-                "ng": [paths + initials] + [paths] * (intervals - 1) + [finals],
-                "equality": equality,
+                "ng": [paths + len(stages.initial_matrix)] + [paths] * (intervals - 1) + [finals],
+                "equality": nlp.equal.tolist(),
                 "fatrop": own,
             }
         else:
@@ -307,11 +293,6 @@ class OcpSolver:
         ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
         stages = z[: self.intervals * width].reshape(self.intervals, width)
         return np.vstack([stages[:, :ns], z[self.intervals * width :]]), stages[:, ns:].copy()
-
-
-def _equality(equalities: int, constraints: int) -> list[bool]:
-    """Whether each constraint is an equality; equalities come first."""
-    return [True] * equalities + [False] * (constraints - equalities)
 
 
 def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
