@@ -15,7 +15,7 @@ import numpy as np
 
 from ballbot_baselines import batched
 from ballbot_baselines.ocp import spent
-from ballbot_baselines.search import ALL_GUESSES, FROM_RIGHTING, Found, search
+from ballbot_baselines.search import ALL_GUESSES, FROM_RIGHTING, Found, attempts
 from ballbot_baselines.shooting import Backoff, Shooting
 from ballbot_gym.checks import finite_array
 from ballbot_gym.display import Moving
@@ -112,11 +112,17 @@ def find_optimum(
     x0, c = finite_array(x0, (params.state_size,), "x0"), finite_array(c, (len(task.constant_names),), "c")
     episode = Shooting(task, params, x0, c, backoff, start)
     started, before = time.perf_counter(), (spent.solving, spent.setup)
-    tried = search(episode, guesses, paths)
+    tried: list[Found] = []
+    for found in attempts(episode, guesses, paths):
+        tried += found
+        if any(solution.is_optimal for _, solution in found):
+            break
     if twice:
         at_once = second_search(task, params, x0[None], c[None], backoff) if twice is True else twice
         tried += _cheaper(episode, at_once, min((s.cost for _, s in tried if s.is_optimal), default=math.inf))
-    best = min((t for t in tried if t[1].is_within_limits), key=_rank, default=None)
+    within = [t for t in tried if t[1].is_within_limits]
+    # optima come before feasible episodes, and cheap ones before expensive ones
+    best = min(within, key=lambda t: (not t[1].success, t[1].cost), default=None)
     if best is None:
         tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for _, s in tried)
         raise PlanError(
@@ -159,11 +165,6 @@ def _cheaper(episode: Shooting, found: batched.BatchOptima | None, cost: float) 
     return [
         (FROM_BATCH, solution) for solution in episode.solve_to_the_end(x, u / episode.params.force_limit, near=True)
     ]
-
-
-def _rank(tried: Found) -> tuple[bool, float]:
-    """Optima come before feasible episodes, and cheap ones before expensive ones."""
-    return not tried[1].success, tried[1].cost
 
 
 def plan_to_track(

@@ -43,23 +43,14 @@ Found = tuple[int, OcpSolution]
 """The index of a guess, and the solution that it led to."""
 
 
-def search(episode: Shooting, guesses: int, paths: list[np.ndarray] | None) -> list[Found]:
-    """Every solution found, up to the first kind of guess that leads to an optimum.
+def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[Found]]:
+    """Every solution found, one kind of guess after the other. The first kind that leads to an optimum suffices.
 
     Args:
         episode: the problem.
         guesses: how many of the task's guessed paths to solve at most.
-        paths: ground paths to start from instead of the task's.
+        given: ground paths to start from instead of the task's.
     """
-    found: list[Found] = []
-    for more in _attempts(episode, guesses, paths):
-        found += more
-        if _any_optimal(found):
-            break
-    return found
-
-
-def _attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[Found]]:
     task, x0, c, params = episode.task, episode.x0, episode.c, episode.params
     paths = task.guess_paths(x0, c, params) if given is None else given
     likely = given is None and guesses > 1 and task.steps % COARSE == 0
@@ -77,10 +68,6 @@ def _attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -
     if alone:
         yield _quickly(episode, paths[0], _HIGH_BARRIER)
         yield _from_paths(episode, paths)
-
-
-def _any_optimal(found: list[Found]) -> bool:
-    return any(solution.is_optimal for _, solution in found)
 
 
 def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[Found]:
@@ -148,7 +135,7 @@ def _from_righting(episode: Shooting) -> list[Found]:
     for member in righting.righted(task, params, episode.x0, c, (1 - episode.backoff.force) * limit, episode.start):
         if not task.first_exit and len(member.u) == task.steps:
             found.append((FROM_RIGHTING, _simulated(episode, member)))
-        if member.side == 0 and _any_optimal(found):
+        if member.side == 0 and any(solution.is_optimal for _, solution in found):
             break
         for x, u in righting.guesses(task, params, member, c):
             if task.first_exit:
