@@ -27,8 +27,7 @@ def integrate(params, x, u, seconds, h):
 def test_linearization_at_origin_is_the_papers(params):
     z = 1e-5 * np.eye(10)
     ahead, back = (dynamics.derivative(params, sign * z[:, :8], sign * z[:, 8:]) for sign in (1, -1))
-    slopes = (ahead - back).T / 2e-5
-    a, b = slopes[:, :8], slopes[:, 8:]
+    a, b = np.split((ahead - back).T / 2e-5, [8], axis=1)
     # the paper's (5) and (6), printed to three decimals; its c is the first digits of 0.29517
     expected_a, expected_b = np.zeros((8, 8)), np.zeros((8, 2))
     expected_a[:4, 4:] = np.eye(4)

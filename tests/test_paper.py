@@ -6,16 +6,9 @@ import pytest
 pytest.importorskip("casadi")
 
 from ballbot_baselines import guess as guesses
+from ballbot_baselines import paper_problems
 from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.paper_problems import (
-    PAPER_PROBLEMS,
-    TRACKING_DT,
-    between_states,
-    compare_stabilization,
-    state,
-    straight_guess,
-    track_plan,
-)
+from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, state, straight_guess
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
@@ -204,15 +197,15 @@ def test_guess_along_an_accelerating_path_is_the_motion_itself(params):
 def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
     pytest.importorskip("pybullet")
     plan = plan_of("stabilize-1")
-    executed, error = track_plan(plan, params)
+    executed, error = paper_problems.track_plan(plan, params)
     assert error < 0.01  # measured: 1 mm
-    assert executed.duration == pytest.approx(plan.trajectory.duration, abs=TRACKING_DT)
+    assert executed.duration == pytest.approx(plan.trajectory.duration, abs=paper_problems.TRACKING_DT)
 
 
 def test_lqr_and_trajectory_optimization_start_where_the_papers_problem_starts():
     pytest.importorskip("pybullet")
     entry = PAPER_PROBLEMS["stabilize-1"]
-    episodes = compare_stabilization(entry)
+    episodes = paper_problems.compare_stabilization(entry)
     steps = {name: np.diff(episode.trajectory.t) for name, episode in episodes.items()}
     assert {name: round(1 / step.mean()) for name, step in steps.items()} == {"lqr": 1000, "trajopt": 50}
     for episode in episodes.values():
