@@ -126,9 +126,7 @@ COMMANDS = {
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
     "bc": _train("dagger", "--iterations 6 --gathering-iterations 0 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(
-        "dagger",
-        "--iterations 4 --gathering-iterations 2 --batch-episodes 0 --episodes-per-iteration 2 --candidate-episodes 0 "
-        "--tracked-rollouts-per-plan 1 --gradient-steps 20",
+        "dagger", "--iterations 4 --gathering-iterations 2 --episodes-per-iteration 64 --gradient-steps 20"
     ),
     "ppo": _train("ppo", _RL),
     "ppo from a policy": _train("ppo", f"{_RL} --start {SHIPPED / 'turn-dagger.json'}"),

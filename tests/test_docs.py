@@ -26,7 +26,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
-    "dagger": "--iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
+    "dagger": "--iterations 1 --episodes-per-iteration 4 --gradient-steps 5",
     "ppo": "--iterations 1 --num-envs 64 --num-steps 48",
     "shac": "--iterations 1 --num-envs 8 --horizon 4",
 }

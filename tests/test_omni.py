@@ -281,7 +281,7 @@ def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
     [
         ("shac", {"horizon": 0, "num_envs": 16, "episode_seconds": 0.3}),
         ("shac", {"horizon": 2, "num_envs": 3}),
-        ("dagger", {"batch_episodes": 0, "episodes_per_iteration": 1, "candidate_episodes": 0, "gradient_steps": 2}),
+        ("dagger", {"episodes_per_iteration": 1, "gradient_steps": 2}),
     ],
 )
 def test_learners_command_three_motors(robot, learner, settings):

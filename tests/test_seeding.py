@@ -27,7 +27,7 @@ SMALL = {
     "hidden": (8,),
     "buffer_size": 1000,
     "gradient_steps": 1,
-    "batch_episodes": ENVS,
+    "episodes_per_iteration": ENVS,
     "gathering_iterations": 1,
     "iterations": 1,
 }
@@ -73,7 +73,7 @@ class Drawn(Exception):
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_trainings_with_neighbouring_seeds_share_no_start(name, starts, monkeypatch):
-    def plan(*arguments):
+    def plan(*arguments, **options):
         raise Drawn
 
     monkeypatch.setattr(batched, "find_optima", plan)

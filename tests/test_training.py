@@ -249,14 +249,7 @@ class Stand(Stabilize):
 
 
 SMALL = {
-    "dagger": {
-        "episodes_per_iteration": 1,
-        "candidate_episodes": 1,
-        "rollouts_per_plan": 1,
-        "max_rollout_seconds": 0.1,
-        "gradient_steps": 2,
-        "max_guesses": 1,
-    },
+    "dagger": {"episodes_per_iteration": 1, "label_seconds": 0.1, "gradient_steps": 2},
     "ppo": {"num_envs": 4, "num_steps": 8, "batch_size": 32},
     "sac": {"num_envs": 2, "num_steps": 2, "batch_size": 4},
     "shac": {"num_envs": 4, "horizon": 3, "iterations": 3},

@@ -85,6 +85,19 @@ class BatchOptima(Rows):
     gains: np.ndarray
     slopes: np.ndarray
 
+    @classmethod
+    def empty(cls, count: int, n: int, state_size: int = 8, action_size: int = 2) -> "BatchOptima":
+        """Of `count` episodes of n control steps, none of them solved."""
+        return cls(
+            costs=np.full(count, np.nan),
+            solved=np.zeros(count, bool),
+            steps=np.full(count, n),
+            states=np.zeros((count, n + 1, state_size)),
+            forces=np.zeros((count, n, action_size)),
+            gains=np.zeros((count, n, action_size, state_size)),
+            slopes=np.zeros((count, n, state_size)),
+        )
+
 
 def solves(task: Task, params: BallbotParams) -> bool:
     """Whether `find_optima` can solve this task here: C code can be compiled, it has all operations of the task, the task has
@@ -128,15 +141,7 @@ def find_optima(
         raise ValueError(f"c must have the shape ({count}, {nc}), not {c.shape}")
     if forces is not None and (forces.shape[::2] != (count, 2) or forces.shape[1] < n):
         raise ValueError(f"forces must have the shape ({count}, at least {n}, 2), not {forces.shape}")
-    optima = BatchOptima(
-        costs=np.full(count, np.nan),
-        solved=np.zeros(count, bool),
-        steps=np.full(count, n),
-        states=np.zeros((count, n + 1, 8)),
-        forces=np.zeros((count, n, 2)),
-        gains=np.zeros((count, n, 2, 8)),
-        slopes=np.zeros((count, n, 8)),
-    )
+    optima = BatchOptima.empty(count, n)
     for first in range(0, count, _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
         batch = _Batch(

@@ -116,15 +116,7 @@ class Algorithm:
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
 
 
-_MAY_BE_ZERO = {
-    "batch_episodes",
-    "candidate_episodes",
-    "gathering_iterations",
-    "horizon",
-    "rollouts_per_plan",
-    "tracked_rollouts_per_plan",
-    "tube_samples",
-}
+_MAY_BE_ZERO = {"gathering_iterations", "horizon"}
 _MAY_BE_NEGATIVE = {"target_entropy"}
 _SHARES = {"final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction"}
 _POSITIVE = {"critic_learning_rate", "final_std", "learning_rate", "std"}
