@@ -163,21 +163,15 @@ def test_without_a_compiler_it_solves_nothing(monkeypatch, params):
 
 
 @pytest.mark.parametrize(
-    ("x0", "c", "forces", "message"),
+    ("x0", "c", "message"),
     [
-        (np.zeros(8), np.zeros((1, 0)), None, r"x0 must have the shape \(B, 8\), not \(8,\)"),
-        (np.zeros((2, 8)), np.zeros((1, 0)), None, r"c must have the shape \(2, 0\), not \(1, 0\)"),
-        (
-            np.zeros((2, 8)),
-            np.zeros((2, 0)),
-            np.zeros((2, 10, 2)),
-            r"forces must have the shape \(2, at least 400, 2\), not \(2, 10, 2\)",
-        ),
+        (np.zeros(8), np.zeros((1, 0)), r"x0 must have the shape \(B, 8\), not \(8,\)"),
+        (np.zeros((2, 8)), np.zeros((1, 0)), r"c must have the shape \(2, 0\), not \(1, 0\)"),
     ],
 )
-def test_wrong_shapes_are_refused(x0, c, forces, message, params):
+def test_wrong_shapes_are_refused(x0, c, message, params):
     with pytest.raises(ValueError, match=message):
-        batched.find_optima(Stabilize(), params, x0, c, forces)
+        batched.find_optima(Stabilize(), params, x0, c)
 
 
 def test_no_episodes_are_no_error(params):

@@ -19,7 +19,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -115,7 +114,6 @@ def find_optima(
     params: BallbotParams,
     x0: np.ndarray,
     c: np.ndarray,
-    forces: np.ndarray | None = None,
     backoff: Backoff = Backoff(),
 ) -> BatchOptima:
     """Optimizes B episodes on one core.
@@ -125,8 +123,6 @@ def find_optima(
         params: the robot.
         x0: (B, 8) initial states.
         c: (B, nc) constants.
-        forces: (B, at least n, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those
-            of a policy; for tasks that end at rest without obstacles.
         backoff: what they keep from margins and goal, and of the grip.
 
     Raises:
@@ -139,20 +135,17 @@ def find_optima(
     count, n, nc = len(x0), task.steps, len(task.constant_names)
     if c.shape != (count, nc):
         raise ValueError(f"c must have the shape ({count}, {nc}), not {c.shape}")
-    if forces is not None and (forces.shape[::2] != (count, 2) or forces.shape[1] < n):
-        raise ValueError(f"forces must have the shape ({count}, at least {n}, 2), not {forces.shape}")
     optima = BatchOptima.empty(count, n)
     for first in range(0, count, _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        batch = _Batch(
+        _Batch(
             task,
             params,
             x0[rows],
             c[rows],
             optima.some(rows),
             replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal)),
-        )
-        batch.search(None if forces is None else forces[rows, :n])
+        ).search()
     optima.solved[:] = np.isfinite(optima.costs)
     return optima
 
@@ -188,14 +181,14 @@ class _Batch:
         """(n, 3) of each slalom, as `Task.passed_obstacles` gives them."""
         return [np.asarray(self._task.passed_obstacles(c)) for c in self._c]
 
-    def search(self, forces: np.ndarray | None) -> None:
+    def search(self) -> None:
         task = self._task
         if task.first_exit:
             self._arrive()
         elif task.passed_obstacles(self._c[0]) is not None and task.steps % search.COARSE == 0:
             self._weave()
         elif len(task.reference(self._x0[0], self._c[0], self._params).x) == 1:
-            self._keep(self._recoveries(forces), _MOTION)  # over the first seconds where LQR is right about the rest
+            self._keep(self._recoveries(), _MOTION)  # over the first seconds where LQR is right about the rest
             self._follow_paths(np.flatnonzero(np.isnan(self._optima.costs)))
         else:
             self._follow_paths(np.arange(len(self._x0)))
@@ -324,22 +317,13 @@ class _Batch:
         whole.solved[:] &= np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
         return _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left), whole
 
-    def _recoveries(self, forces: np.ndarray | None) -> _Guesses:
+    def _recoveries(self) -> _Guesses:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
         task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
         n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
         given, times = self._given(np.arange(count), task.steps), task.control_dt * np.arange(n)
         best = np.full(count, np.inf)
         x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
-
-        def improve(rows: np.ndarray, given_actions: np.ndarray, *followed: Any) -> None:
-            simulated = self._solver.simulate(x0[rows], task.control_dt, given[rows], given_actions[rows], *followed)
-            states, actions, costs = simulated
-            if rest is not None and n < task.steps:
-                costs = costs + rest.costs(states[:, -1] - self._ends[rows])
-            cheaper = costs < best[rows]
-            for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
-                kept[rows[cheaper]] = values[cheaper]
 
         side = righting.leaning_aside(x0, np.ones(count)).T
         path = np.zeros((count, n, 4))
@@ -348,9 +332,19 @@ class _Batch:
             rows = np.flatnonzero(np.isinf(best))
             for bandwidth, seconds, lean, fade in family if len(rows) else ():
                 path[..., 2:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
-                improve(rows, np.zeros_like(a), path[rows], (bandwidth, seconds))
-        if forces is not None:
-            improve(np.arange(count), forces[:, :n] / self._params.force_limit)
+                states, actions, costs = self._solver.simulate(
+                    x0[rows],
+                    task.control_dt,
+                    given[rows],
+                    np.zeros((len(rows), n, 2)),
+                    path[rows],
+                    (bandwidth, seconds),
+                )
+                if rest is not None and n < task.steps:
+                    costs = costs + rest.costs(states[:, -1] - self._ends[rows])
+                cheaper = costs < best[rows]
+                for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
+                    kept[rows[cheaper]] = values[cheaper]
         return _Guesses(np.arange(count), x, a, np.full(count, n)).some(np.isfinite(best))
 
     def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> _Guesses:
