@@ -90,6 +90,7 @@ _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
 _HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
+_GUESSES = 5  # of an optimum that is found alone
 _ROBOTS = 16  # of an iteration on a track
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
@@ -304,7 +305,8 @@ def _found_one_by_one(
     optima = batched.BatchOptima.empty(len(x0), task.steps, params.state_size, params.action_size)
     for i, (start, constants) in enumerate(zip(x0, c, strict=True)):
         try:
-            found = find_optimum(task, params, start, constants, backoff)
+            # with wheels each guess takes seconds
+            found = find_optimum(task, params, start, constants, backoff, 1 if params.wheels is not None else _GUESSES)
         except PlanError:
             continue
         plan, n = found.trajectory, len(found.trajectory.u)
