@@ -33,7 +33,7 @@ HONEST = [
 HONEST += [
     (task, "sac", physics, "paper") for task in ("stabilize", "orbit") for physics in ("rk4", "bullet", "mujoco")
 ]
-HONEST += [("turn", "dagger", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
+HONEST += [("turn", "shac", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
 
 
 def make(folder: Path) -> list[Path]:

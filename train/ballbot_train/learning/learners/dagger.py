@@ -82,7 +82,8 @@ TUNED: dict[str, DaggerConfig] = {
 }
 """Exceptions by name of task; every other task takes the defaults."""
 
-_NOISE = 0.2  # of the expert's actions: each episode draws the standard deviation of its noise from 0 to this
+# of the expert's actions, and where the ball may slip: each episode draws the deviation of its noise from 0 to this
+_NOISE, _NOISE_IN_GRIP = 0.2, 0.05
 _STATES = 32  # of each optimum that become samples, on average
 _SMALL = 0.3  # of the force limit: a derivative is no guide to greater changes
 _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
@@ -91,6 +92,7 @@ _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
 _HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
 _GUESSES = 5  # of an optimum that is found alone
+_MOST_ALONE = 16  # of the optima that pass obstacles on other sides than the learner shall
 _ROBOTS = 16  # of an iteration on a track
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
@@ -214,13 +216,20 @@ class Dagger:
         """
         task, limits = self._task, np.array([[robot.force_limit] for robot in robots])
         c = state.c.T.double().numpy()
-        optima = self._optima_of(robots, self._ahead(batch, state), c)
-        usable, costs = optima.solved & self._on_routes(optima, batch.observe(state), c), optima.costs
+        x, sides = self._ahead(batch, state), self._sides(batch.observe(state), c)
+        optima = self._optima_of(robots, x, c)
+        if before is None:
+            others = np.flatnonzero(~self._passes(optima, c, sides))
+            for i in rng.permutation(others)[:_MOST_ALONE].tolist() if len(others) else ():
+                path = task.routed_path(x[i], c[i], sides[i])
+                _find_alone(optima, i, task, robots[i], x[i], c[i], self.config.backoff, [path])
+        usable, costs = optima.solved & self._passes(optima, c, sides), optima.costs
         if before is not None:
             costs = np.where(before[0].solved, before[0].costs, costs)
             usable &= _goes_on(optima, *before)
         steps = round(self.config.label_seconds / task.control_dt)
-        expert, noise = rng.random((len(robots), 1)) < 0.5, _NOISE * rng.random((len(robots), 1))
+        expert = rng.random((len(robots), 1)) < 0.5
+        noise = (_NOISE_IN_GRIP if self._params.grips else _NOISE) * rng.random((len(robots), 1))
         states, lasted, running = [], np.zeros(len(robots), int), np.ones(len(robots), bool)
         seen, labels, weights = [], [], []
         for k in range(min(steps, task.steps)):
@@ -266,16 +275,23 @@ class Dagger:
             found.append(vars(find(task, robot, x[of], c[of], backoff=backoff)))
         return batched.BatchOptima(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
 
-    def _on_routes(self, optima: batched.BatchOptima, observation: torch.Tensor, c: np.ndarray) -> np.ndarray:
-        """(B,) whether optima pass the obstacles ahead on the sides that the learner's routes choose, if it has any."""
+    def _sides(self, observation: torch.Tensor, c: np.ndarray) -> list[tuple[int, ...]]:
+        """On which sides the learner's routes pass the obstacles of B episodes; for each none, if it has no routes."""
         if self.network.routes is None:
-            return np.ones(len(c), bool)
-        agree = []
-        for path, sides, constants in zip(optima.states, self.network.routes(observation).tolist(), c, strict=True):
-            obstacles = np.asarray(self._task.passed_obstacles(constants))
-            passed = zip(search.side_choice(path, obstacles), sides, obstacles[:, 0] < path[0, 0], strict=False)
-            agree.append(all(behind or mine == wanted for mine, wanted, behind in passed))
-        return np.array(agree)
+            return [()] * len(c)
+        chosen = self.network.routes(observation).int().tolist()
+        counts = [len(np.asarray(self._task.passed_obstacles(each))) for each in c]
+        return [tuple(sides[:count]) for sides, count in zip(chosen, counts, strict=True)]
+
+    def _passes(self, optima: batched.BatchOptima, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """(B,) whether optima pass the obstacles ahead of their beginnings on these sides."""
+        passes = np.ones(len(c), bool)
+        for i, wanted in enumerate(sides):
+            if wanted:
+                obstacles, path = np.asarray(self._task.passed_obstacles(c[i])), optima.states[i]
+                mine, behind = search.side_choice(path, obstacles), obstacles[:, 0] < path[0, 0]
+                passes[i] = ((np.array(mine) == wanted) | behind).all()
+        return passes
 
     def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
         """(B, 8) where the robots will be when a force of now arrives, after those that are on their way."""
@@ -303,18 +319,32 @@ def _found_one_by_one(
 ) -> batched.BatchOptima:
     """As `batched.find_optima`, of tasks and robots that it does not solve. There are no slopes."""
     optima = batched.BatchOptima.empty(len(x0), task.steps, params.state_size, params.action_size)
-    for i, (start, constants) in enumerate(zip(x0, c, strict=True)):
-        try:
-            # with wheels each guess takes seconds
-            found = find_optimum(task, params, start, constants, backoff, 1 if params.wheels is not None else _GUESSES)
-        except PlanError:
-            continue
-        plan, n = found.trajectory, len(found.trajectory.u)
-        if found.is_optimal:
-            optima.costs[i], optima.solved[i], optima.steps[i] = found.cost, True, n
-            optima.states[i] = plan.x[np.minimum(np.arange(task.steps + 1), n)]
-            optima.forces[i, :n], optima.gains[i, :n] = plan.u, tube_gains(task, params, plan, constants)
+    for i in range(len(x0)):
+        _find_alone(optima, i, task, params, x0[i], c[i], backoff)
     return optima
+
+
+def _find_alone(
+    optima: batched.BatchOptima,
+    i: int,
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    paths: list[np.ndarray] | None = None,
+) -> None:
+    """Puts the optimum of one episode, from ground paths or from the task's, in its place."""
+    guesses = 1 if params.wheels is not None else _GUESSES  # with wheels each takes seconds
+    try:
+        found = find_optimum(task, params, x0, c, backoff, guesses, paths)
+    except PlanError:
+        return
+    plan, n = found.trajectory, len(found.trajectory.u)
+    if found.is_optimal:
+        optima.costs[i], optima.solved[i], optima.steps[i] = found.cost, True, n
+        optima.states[i] = plan.x[np.minimum(np.arange(task.steps + 1), n)]
+        optima.forces[i, :n], optima.gains[i, :n] = plan.u, tube_gains(task, params, plan, c)
 
 
 def _first_samples(
