@@ -177,7 +177,7 @@ def test_every_episode_of_a_track_has_a_robot_of_its_own(play):
 
 
 def test_another_task_or_robot_keeps_the_controllers_that_it_has(play):
-    playground = play(ghosts=["shac"])
+    playground = play(ghosts=["sac"])
     for change in (lambda: playground.set_world(robot="rolling"), lambda: playground.set_world("orbit")):
         change()
         playground.step()
