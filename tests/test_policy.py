@@ -18,7 +18,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller, names
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_policy, save_policy
-from ballbot_train.policy_files import PolicyError, PolicySpec, read_description, shipped_policies
+from ballbot_train.policy_files import BEST, PolicyError, PolicySpec, read_description, shipped_policies
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -133,3 +133,10 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
     row = evaluate(learner, name, episodes, robot=robot)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_mean < 3 * max(measured["regret_mean"], 0.01)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_pages_show_the_policy_of_the_least_regret(name):
+    described = {learner: read_description(path) for learner, path in shipped_policies(make_task(name)).items()}
+    regrets = {learner: each["measured"]["regret_mean"] for learner, each in described.items()}
+    assert BEST[name] == min(regrets, key=regrets.__getitem__)
