@@ -227,7 +227,7 @@ class Dagger:
         if before is not None:
             costs = np.where(before[0].solved, before[0].costs, costs)
             usable &= _goes_on(optima, *before)
-        steps = round(self.config.label_seconds / task.control_dt)
+        steps = max(1, round(self.config.label_seconds / task.control_dt))
         expert = rng.random((len(robots), 1)) < 0.5
         noise = (_NOISE_IN_GRIP if self._params.grips else _NOISE) * rng.random((len(robots), 1))
         states, lasted, running = [], np.zeros(len(robots), int), np.ones(len(robots), bool)
