@@ -141,7 +141,7 @@ def note(row: Entry, episode: int) -> str:
     if result.failure:
         end = row.ends[episode]
         return "falls" if end == "tilt" else "touches an obstacle" if end.startswith("obstacle") else f"fails: {end}"
-    return f"{100 * (result.cost / result.optimum - 1):.1f} %"
+    return f"{round(100 * (result.cost / result.optimum - 1), 1) + 0.0:.1f} %"  # 0.0, and not -0.0
 
 
 def main() -> None:
