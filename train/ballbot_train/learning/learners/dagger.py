@@ -91,7 +91,6 @@ _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
 _HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
-_GUESSES = 5  # of an optimum that is found alone
 _MOST_ALONE = 16  # of the optima that pass obstacles on other sides than the learner shall
 _ROBOTS = 16  # of an iteration on a track
 _FINAL_LEARNING_RATE_FRACTION = 0.01
@@ -188,13 +187,13 @@ class Dagger:
         which the learner does not succeed.
         """
         hard = round(_HARD_SHARE * count) if self.iteration else 0
-        drawn = count - hard + _HARD_AMONG * hard
-        x, c = map(np.array, zip(*(self._task.sample(rng, self._params) for _ in range(drawn)), strict=True))
+        some, among = count - hard, _HARD_AMONG * hard
+        x, c = map(np.array, zip(*(self._task.sample(rng, self._params) for _ in range(some + among)), strict=True))
         if not hard:
             return x, c
-        batch = BallbotBatch(self._task, drawn, compile=False, params=self._params, history=self._history)
-        chosen = np.argsort(run_episodes(batch, self.network, x, c).success.numpy()[count - hard :], kind="stable")
-        rows = np.append(np.arange(count - hard), count - hard + chosen[:hard])
+        batch = BallbotBatch(self._task, among, compile=False, params=self._params, history=self._history)
+        success = run_episodes(batch, self.network, x[some:], c[some:]).success.numpy()
+        rows = np.append(np.arange(some), some + np.argsort(success, kind="stable")[:hard])
         rng.shuffle(rows)
         return x[rows], c[rows]
 
@@ -216,7 +215,7 @@ class Dagger:
         """
         task, limits = self._task, np.array([[robot.force_limit] for robot in robots])
         c = state.c.T.double().numpy()
-        x, sides = self._ahead(batch, state), self._sides(batch.observe(state), c)
+        x, sides = self._ahead(batch, state), self._sides(batch.observe(state))
         optima = self._optima_of(robots, x, c)
         if before is None:
             others = np.flatnonzero(~self._passes(optima, c, sides))
@@ -275,13 +274,11 @@ class Dagger:
             found.append(vars(find(task, robot, x[of], c[of], backoff=backoff)))
         return batched.BatchOptima(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
 
-    def _sides(self, observation: torch.Tensor, c: np.ndarray) -> list[tuple[int, ...]]:
+    def _sides(self, observation: torch.Tensor) -> list[tuple[int, ...]]:
         """On which sides the learner's routes pass the obstacles of B episodes; for each none, if it has no routes."""
         if self.network.routes is None:
-            return [()] * len(c)
-        chosen = self.network.routes(observation).int().tolist()
-        counts = [len(np.asarray(self._task.passed_obstacles(each))) for each in c]
-        return [tuple(sides[:count]) for sides, count in zip(chosen, counts, strict=True)]
+            return [()] * len(observation)
+        return [tuple(sides) for sides in self.network.routes(observation).int().tolist()]
 
     def _passes(self, optima: batched.BatchOptima, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> np.ndarray:
         """(B,) whether optima pass the obstacles ahead of their beginnings on these sides."""
@@ -290,7 +287,7 @@ class Dagger:
             if wanted:
                 obstacles, path = np.asarray(self._task.passed_obstacles(c[i])), optima.states[i]
                 mine, behind = search.side_choice(path, obstacles), obstacles[:, 0] < path[0, 0]
-                passes[i] = ((np.array(mine) == wanted) | behind).all()
+                passes[i] = ((np.array(mine) == wanted[: len(mine)]) | behind).all()
         return passes
 
     def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
@@ -335,9 +332,9 @@ def _find_alone(
     paths: list[np.ndarray] | None = None,
 ) -> None:
     """Puts the optimum of one episode, from ground paths or from the task's, in its place."""
-    guesses = 1 if params.wheels is not None else _GUESSES  # with wheels each takes seconds
+    fewer: dict[str, Any] = {} if params.wheels is None else {"guesses": 1}  # each takes seconds
     try:
-        found = find_optimum(task, params, x0, c, backoff, guesses, paths)
+        found = find_optimum(task, params, x0, c, backoff, paths=paths, **fewer)
     except PlanError:
         return
     plan, n = found.trajectory, len(found.trajectory.u)
