@@ -148,21 +148,16 @@ def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ..
 def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     import gymnasium
     from stable_baselines3 import PPO
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     from ballbot_gym.env import make_task
     from ballbot_gym.params import default_params
     from ballbot_train.policy_files import PolicyError
-    from ballbot_train.saved_models import load_actor, save_vecnormalize
+    from ballbot_train.saved_models import load_actor
 
-    env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("BallbotTurn-v0", physics="rk4")]))
+    env = gymnasium.make("BallbotTurn-v0", physics="rk4")
     path = folder / "mine.zip"
     PPO("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu").save(path)
-    return (
-        [path, save_vecnormalize(env, path)],
-        lambda: load_actor(path, make_task("turn"), default_params()),
-        (PolicyError,),
-    )
+    return [path], lambda: load_actor(path, make_task("turn"), default_params()), (PolicyError,)
 
 
 def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:

@@ -32,3 +32,13 @@ def test_plain_ppo_with_a_wrapper_trains_and_is_measured_on_fresh_episodes(capsy
     load("plain_ppo").main(steps=16, episodes=5)
     printed = capsys.readouterr().out
     assert "failures in 5" in printed
+
+
+def test_learning_curves_are_of_all_seeds_of_a_folder(capsys, tmp_path):
+    for seed, regrets in enumerate(((4.0, 2.0, 0.0), (4.0, 4.0))):
+        (tmp_path / "runs" / f"seed-{seed}").mkdir(parents=True)
+        rows = "".join(f"{60 * i},{1 + regret}\n" for i, regret in enumerate(regrets))
+        (tmp_path / "runs" / f"seed-{seed}" / "evaluations.csv").write_text(f"cpu_seconds,cost_ratio\n{rows}")
+    load("learning_curves").main((tmp_path / "runs",), tmp_path / "curves.png")
+    assert "median 200.00%, worst 400.00% of 2 seeds" in capsys.readouterr().out
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")

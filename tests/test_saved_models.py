@@ -23,12 +23,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
-from ballbot_train import save_vecnormalize
-from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
-from ballbot_train.evaluation.evaluate import Predictor, evaluate
+from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.policy_files import PolicyError
-from ballbot_train.saved_models import load_actor, statistics_of
+from ballbot_train.saved_models import load_actor
 
 TASK = make_task("stabilize")
 OBSERVATIONS = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
@@ -78,19 +77,11 @@ def normalized(tmp_path):
     return model, path
 
 
-def test_statistics_of_vecnormalize_are_applied(normalized):
-    model, path = normalized
-    save_vecnormalize(model.get_vec_normalize_env(), path)
-    expected = Predictor(model, TASK, default_params())(OBSERVATIONS, begins=True)
-    np.testing.assert_allclose(acts(path), np.clip(expected, -1, 1), atol=1e-5)
-    before = policy_digests({"stabilize": [str(path)]})
-    statistics_of(path).write_bytes(b"other")
-    assert policy_digests({"stabilize": [str(path)]}) != before
-
-
-def test_a_model_whose_statistics_are_missing_is_refused_with_how_to_write_them(normalized):
+def test_a_saved_model_with_statistics_of_vecnormalize_is_refused(normalized):
     _, path = normalized
-    with pytest.raises(PolicyError, match=r"was trained with VecNormalize, and .*save_vecnormalize"):
+    with pytest.raises(
+        PolicyError, match=r"has statistics of VecNormalize, which is not read; .* load the model where"
+    ):
         acts(path)
 
 
@@ -212,13 +203,13 @@ def with_weights(**changes):
         (with_weights(weight=lambda weight: weight + 3e38), "holds numbers beyond ±1e"),
         (with_weights(weight=lambda weight: torch.ones(1).expand(2, 2**28)), "numbers, and stores fewer"),
         (with_weights(bias=lambda bias: torch.zeros(3)), "is no network of linear layers that ends in 2 actions"),
-        (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}; known: elu"),
+        (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}, which is not read"),
         (lambda members: members.pop("data"), "it holds no data"),
         (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
-        (with_data(use_sde=True), "explores by its state"),
+        (with_data(use_sde=True), "exploration by its state"),
         (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
-        (with_data(policy_kwargs={"features_extractor_class": "x"}), "extracts features"),
-        (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation <class 'Mish'>; known: elu"),
+        (with_data(policy_kwargs={"features_extractor_class": "x"}), "a network that extracts features"),
+        (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation mish, which is not read"),
     ],
 )
 def test_models_that_are_damaged_or_of_another_kind_are_refused(change, message, tmp_path, capsys):
@@ -228,8 +219,3 @@ def test_models_that_are_damaged_or_of_another_kind_are_refused(change, message,
     with pytest.raises(PolicyError, match=message):
         acts(path)
     assert "executed" not in capsys.readouterr().out
-
-
-def test_only_a_vecnormalize_of_plain_observations_is_saved(tmp_path):
-    with pytest.raises(TypeError, match="give a VecNormalize of plain observations"):
-        save_vecnormalize(envs(), tmp_path / "model.zip")

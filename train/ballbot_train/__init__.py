@@ -8,7 +8,6 @@ Short import paths that stay where they are; each imports what it needs when it 
 | `evaluate_fresh` | thousands of fresh episodes of a policy: `ballbot_train.evaluation.fresh.evaluate_fresh` |
 | `load_policy` | a policy file as a Controller with `predict`: `ballbot_train.policy.load_policy` |
 | `shipped_policies` | the policies that come with the package: `ballbot_train.policy_files.shipped_policies` |
-| `save_vecnormalize` | statistics of VecNormalize beside a saved model: `ballbot_train.saved_models.save_vecnormalize` |
 | `BallbotVecEnv` | batched environments for Stable-Baselines3: `ballbot_train.learning.sb3.BallbotVecEnv` |
 | `RegretCallback` | the regret of an SB3 model while it trains: `ballbot_train.learning.callbacks.RegretCallback` |
 """
@@ -22,13 +21,11 @@ if TYPE_CHECKING:
     from ballbot_train.learning.sb3 import BallbotVecEnv as BallbotVecEnv
     from ballbot_train.policy import load_policy as load_policy
     from ballbot_train.policy_files import shipped_policies as shipped_policies
-    from ballbot_train.saved_models import save_vecnormalize as save_vecnormalize
 
 _LAZY = {
     "evaluate": "ballbot_train.evaluation.evaluate:evaluate",
     "evaluate_fresh": "ballbot_train.evaluation.fresh:evaluate_fresh",
     "load_policy": "ballbot_train.policy:load_policy",
-    "save_vecnormalize": "ballbot_train.saved_models:save_vecnormalize",
     "shipped_policies": "ballbot_train.policy_files:shipped_policies",
     "BallbotVecEnv": "ballbot_train.learning.sb3:BallbotVecEnv",
     "RegretCallback": "ballbot_train.learning.callbacks:RegretCallback",

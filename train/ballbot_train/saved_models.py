@@ -1,13 +1,8 @@
 """Saved models of Stable-Baselines3 as policies: their weights alone are read, and nothing in them is executed.
 
-| file | from | read are |
-|---|---|---|
-| MODEL.zip | `model.save` of Stable-Baselines3 | `policy.pth`, as tensors; from `data`, plain JSON values |
-| MODEL.vecnormalize.npz | `save_vecnormalize`, where observations were normalized | arrays of numbers |
-
-These are PPO, A2C, SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO.
-
-Pickles, such as `VecNormalize.save` writes, can execute code, and are not read.
+Of MODEL.zip, as `model.save` writes it, `policy.pth` is read as tensors, and of `data` plain JSON values. These are PPO, A2C,
+SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO. Pickles, such as `VecNormalize.save` writes, can execute
+code, and are not read.
 """
 
 import hashlib
@@ -32,29 +27,39 @@ with imports_of(__name__):
 
 _ACTIVATIONS = {name.lower(): name for name in ("ELU", "GELU", "LeakyReLU", "ReLU", "SELU", "SiLU", "Tanh")}
 _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here
+_ON_POLICY, _OFF_POLICY = ("mlp_extractor.policy_net.", "action_net."), ("actor.latent_pi.", "actor.mu.")
+"""How the names of actors' layers begin."""
 _DATA_LIMIT = 2**24  # bytes of JSON
-_SUPPORTED = "give a model with MlpPolicy, or load the model yourself and give it to ballbot_train.evaluate"
 
 
-class Spaces(NamedTuple):
-    """What a model was trained on: a Box, or the name of a space of another kind."""
+class Saved(NamedTuple):
+    """What is read of a model."""
 
+    layers: list[Any]
+    """Weight and bias of each."""
+    activation: str
+    """Between them, a name in `torch.nn`."""
+    squashed: bool
+    """Whether the output is, by tanh."""
     observation_space: spaces.Box | str
     action_space: spaces.Box | str
+    """What it was trained on: a Box, or the name of a space of another kind."""
+
+    @property
+    def observations(self) -> int:
+        """Numbers of an observation."""
+        return self.layers[0][0].shape[1]
 
 
 class SavedActor(torch.nn.Module):
-    """Normalizes observations, runs the network, and brings its output into [−1, 1]."""
+    """Runs a network, and brings its output into [−1, 1]."""
 
-    def __init__(self, network: torch.nn.Module, squashed: bool, statistics: Mapping[str, Any] | None):
-        """Args: squashed: whether the output is, by tanh; statistics: as of `_read`."""
+    def __init__(self, network: torch.nn.Module, squashed: bool):
+        """Args: squashed: whether the output is, by tanh; else it is clipped."""
         super().__init__()
-        self.network, self._squashed, self._statistics = network, squashed, statistics
+        self.network, self._squashed = network, squashed
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        if self._statistics is not None:
-            mean, scale, limit = (self._statistics[name] for name in ("mean", "scale", "limit"))
-            observation = ((observation.double() - mean) / scale).clamp(-limit, limit).float()
         action = self.network(observation)
         return torch.tanh(action) if self._squashed else action.clamp(-1.0, 1.0)
 
@@ -102,13 +107,8 @@ def _in_words(space: Any) -> str:
 
 
 def observations_of(path: str | Path) -> int:
-    """The size of the observations that a saved model takes.
-
-    Raises:
-        PolicyError: as `load_actor`.
-    """
-    layers, *_ = _read(path)
-    return layers[0][0].shape[1]
+    """The size of the observations that a saved model takes; raises a PolicyError as `load_actor`."""
+    return _read(path).observations
 
 
 def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
@@ -117,52 +117,16 @@ def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
     Raises:
         PolicyError: as `load_actor`; also where the size is the task's and the spaces are not.
     """
-    layers, *_, trained = _read(path)
-    if layers[0][0].shape[1] != len(task.observation_scale):
+    model = _read(path)
+    if model.observations != len(task.observation_scale):
         return False
-    check_spaces(str(path), trained, task, params)
+    check_spaces(str(path), model, task, params)
     return True
 
 
 def digest(path: str | Path) -> str:
-    """SHA-256 of a saved model and of the statistics beside it, as hexadecimal digits."""
-    beside = [other for other in (statistics_of(path),) if other.exists()]
-    return hashlib.sha256(b"".join(files.read(part) for part in (path, *beside))).hexdigest()
-
-
-def statistics_of(path: str | Path) -> Path:
-    """The path of the statistics of a saved model's observations."""
-    path = Path(path)
-    return path.with_name(f"{path.stem}.vecnormalize.npz")
-
-
-def save_vecnormalize(normalization: Any, model: str | Path) -> Path:
-    """Writes the statistics of a Stable-Baselines3 `VecNormalize` beside a saved model, for `ballbot evaluate MODEL.zip`.
-
-    Args:
-        normalization: the VecNormalize, for instance of `model.get_vec_normalize_env()`, or of `VecNormalize.load`.
-        model: path of the saved model, MODEL.zip or MODEL.
-
-    Returns:
-        The path of the file, MODEL.vecnormalize.npz.
-
-    Raises:
-        TypeError: it is no VecNormalize of plain observations.
-    """
-    model = Path(model)
-    model = model if model.suffix == ".zip" else model.with_name(f"{model.name}.zip")
-    moments = getattr(normalization, "obs_rms", None)
-    if not hasattr(normalization, "norm_obs") or (normalization.norm_obs and not hasattr(moments, "mean")):
-        raise TypeError(f"give a VecNormalize of plain observations, not {normalization!r}")
-    arrays: dict[str, np.ndarray] = {"normalized": np.array(int(normalization.norm_obs))}
-    if normalization.norm_obs and moments is not None:
-        arrays |= {
-            "mean": np.asarray(moments.mean, np.float64),
-            "variance": np.asarray(moments.var, np.float64),
-            "epsilon": np.array(float(normalization.epsilon)),
-            "limit": np.array(float(normalization.clip_obs)),
-        }
-    return files.write_npz(statistics_of(model), arrays)
+    """SHA-256 of a saved model, as hexadecimal digits."""
+    return hashlib.sha256(files.read(path)).hexdigest()
 
 
 def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActor:
@@ -177,22 +141,18 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
-    found, activation, squashed, normalization, trained = _read(path)
-    size = found[0][0].shape[1]
-    if size != len(task.observation_scale):
-        raise PolicyError(f"{path} takes {size} observations, {task.id} has {len(task.observation_scale)}")
-    check_spaces(str(path), trained, task, params)
-    if normalization is not None and len(normalization["mean"]) != size:
-        raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
-    widths = (size, *(len(bias) for _, bias in found))
-    network = linear_layers(widths, getattr(torch.nn, _ACTIVATIONS[activation]), device="cpu", dtype=torch.float32)
-    for linear, (weight, bias) in zip(list(network)[::2], found, strict=True):
+    model, size = _read(path), len(task.observation_scale)
+    if model.observations != size:
+        raise PolicyError(f"{path} takes {model.observations} observations, {task.id} has {size}")
+    check_spaces(str(path), model, task, params)
+    widths = (size, *(len(bias) for _, bias in model.layers))
+    network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
+    for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-    return SavedActor(network, squashed, normalization).eval()
+    return SavedActor(network, model.squashed).eval()
 
 
-def _read(path: str | Path) -> tuple[list[Any], str, bool, dict[str, Any] | None, Spaces]:
-    """Layers (weight, bias), activation, whether tanh squashes, statistics of observations, or None, and the spaces."""
+def _read(path: str | Path) -> Saved:
     try:
         return _read_zip(Path(path))
     except PolicyError:
@@ -202,40 +162,34 @@ def _read(path: str | Path) -> tuple[list[Any], str, bool, dict[str, Any] | None
         raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {reason}") from error
 
 
-def _read_zip(path: Path) -> tuple[list[Any], str, bool, dict[str, Any] | None, Spaces]:
+def _read_zip(path: Path) -> Saved:
     members = files.unzipped(files.read(path), path)
     for name in ("data", "policy.pth"):
         if name not in members:
             raise PolicyError(f"{path} is no saved Stable-Baselines3 model: it holds no {name}")
     data = files.read_json(f"data in {path}", _DATA_LIMIT, members["data"])
     weights = saved_by_torch(members["policy.pth"], f"policy.pth in {path}")
-    made_by = str(data["policy_class"].get("__module__", ""))
-    if not made_by.startswith(_MODULES):
+    options, made_by = data.get("policy_kwargs") or {}, str(data["policy_class"].get("__module__", ""))
+    extracts = any("features_extractor" in name or "lstm" in name for name in [*weights, *options])
+    begins = next((start for start in (_ON_POLICY, _OFF_POLICY) if any(n.startswith(start[-1]) for n in weights)), ())
+    usual = "tanh" if begins == _ON_POLICY else "relu"
+    activation = str(options.get("activation_fn", usual)).rstrip("'>").rpartition(".")[2].rpartition("'")[2].lower()
+    unread = {
+        f"a policy of {made_by or 'an unknown module':.100}": not made_by.startswith(_MODULES),
+        "a network that extracts features": extracts,
+        "exploration by its state (use_sde)": data.get("use_sde"),
+        # only on-policy algorithms leave this empty where there was no VecNormalize
+        "statistics of VecNormalize": "gae_lambda" in data and data.get("_last_original_obs") is not None,
+        f"the activation {activation:.100}": activation not in _ACTIVATIONS,
+        f"no actor, but {', '.join(list(weights)[:4]):.200}": not begins,
+    }
+    if reasons := [what for what, holds in unread.items() if holds]:
         raise PolicyError(
-            f"{path} has a policy of {made_by or 'an unknown module':.100}, which is not read; {_SUPPORTED}"
+            f"{path} has {reasons[0]}, which is not read; give a model with MlpPolicy, or load the model where you trust it, "
+            "and give it to ballbot_train.evaluate"
         )
-    options = data.get("policy_kwargs") or {}
-    unknown = [name for name in weights if "features_extractor" in name or "lstm" in name]
-    if unknown or "features_extractor_class" in options:
-        raise PolicyError(
-            f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]:.100}); {_SUPPORTED}"
-        )
-    if data.get("use_sde"):
-        raise PolicyError(f"{path} explores by its state (use_sde), which is not read; {_SUPPORTED}")
-    if "action_net.weight" in weights:
-        layers, usual = _layers(path, weights, "mlp_extractor.policy_net.", "action_net."), "tanh"
-    elif any(name.startswith("actor.latent_pi.") for name in weights):
-        layers, usual = _layers(path, weights, "actor.latent_pi.", "actor.mu."), "relu"
-    elif "actor.mu.0.weight" in weights:
-        layers, usual = _layers(path, weights, "actor.mu."), "relu"
-    else:
-        raise PolicyError(f"{path} has no actor that is read, but {', '.join(list(weights)[:4]):.200}, …; {_SUPPORTED}")
-    named = str(options.get("activation_fn", usual))
-    activation = named.rstrip("'>").rpartition(".")[2].rpartition("'")[2].lower()
-    if activation not in _ACTIVATIONS:
-        raise PolicyError(f"{path} has the activation {named:.100}; known: {', '.join(_ACTIVATIONS)}")
-    found = Spaces(_space(data["observation_space"]), _space(data["action_space"]))
-    return layers, activation, usual == "relu", _statistics(path, data), found
+    found = (_space(data[name]) for name in ("observation_space", "action_space"))
+    return Saved(_layers(path, weights, *begins), _ACTIVATIONS[activation], usual == "relu", *found)
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:
@@ -247,35 +201,6 @@ def _space(described: Mapping[str, Any]) -> spaces.Box | str:
     words = (str(described[end]).replace("[", " ").replace("]", " ").split() for end in ("low", "high"))
     low, high = (np.array(each, np.float64).astype(dtype).reshape(shape) for each in words)
     return spaces.Box(low, high, dtype=dtype.type)
-
-
-def _statistics(path: Path, data: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Mean, scale and limit of the normalization of observations, or None."""
-    beside = statistics_of(path)
-    if not beside.exists():
-        # Only on-policy algorithms leave this empty where there was no VecNormalize.
-        if "gae_lambda" in data and data.get("_last_original_obs") is not None:
-            raise PolicyError(
-                f"{path} was trained with VecNormalize, and {beside} is missing. Its own file is a pickle, which can execute "
-                f"code and is not read. Write the statistics where you trust it: ballbot_train.save_vecnormalize("
-                f'VecNormalize.load("vecnormalize.pkl", venv), "{path}")'
-            )
-        return None
-    arrays = files.read_npz(beside)
-    try:
-        if not files.numbers(arrays["normalized"], "normalized", ()):
-            return None
-        mean = files.numbers(arrays["mean"], "mean")
-        variance = files.numbers(arrays["variance"], "variance", (mean.size,))
-        epsilon, limit = (float(files.numbers(arrays[name], name, ())) for name in ("epsilon", "limit"))
-        if mean.ndim != 1 or limit <= 0 or (variance + epsilon <= 0).any():
-            raise ValueError("mean must be a row of numbers, variance + epsilon and limit positive")
-    except (KeyError, ValueError) as error:
-        raise PolicyError(
-            f"{beside} is damaged ({error}); write it again with ballbot_train.save_vecnormalize"
-        ) from error
-    scale = torch.sqrt(torch.from_numpy(variance + epsilon))
-    return {"mean": torch.from_numpy(mean), "scale": scale, "limit": limit}
 
 
 def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]:

@@ -11,7 +11,7 @@ COMMANDS = {
     name: f"{__name__}.{name}:{name}"
     for name in (
         *("benchmark", "evaluate", "compare", "submit", "verify", "robustness", "transfer", "basins", "paper"),
-        *("optimize", "replay", "play", "page", "certify", "demos", "export", "train", "curves", "tune", "new"),
+        *("optimize", "replay", "play", "page", "certify", "demos", "export", "train", "tune", "new"),
     )
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""

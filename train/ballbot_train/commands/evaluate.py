@@ -40,8 +40,7 @@ def evaluate(
 
     Args:
         policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a policy that comes
-            with the package. Statistics of VecNormalize are read from
-            MODEL.vecnormalize.npz beside the model, which `ballbot_train.save_vecnormalize` writes.
+            with the package.
         task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
         fresh: how many fresh episodes, in the batched closed-form model. They are never the certified ones.
         seed: of the fresh episodes.

@@ -17,7 +17,7 @@ from ballbot_train.policy_files import read_description, shipped_policies, weigh
 FILTERED = "-ekf"
 """Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
 
-_BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
+_BESIDE = (".json", ".safetensors")  # endings of the files of a policy
 
 
 def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:

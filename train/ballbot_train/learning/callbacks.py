@@ -1,6 +1,7 @@
 """`RegretCallback`: the regret of a Stable-Baselines3 model while it trains."""
 
 import io
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,8 @@ from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate
-from ballbot_train.saved_models import save_vecnormalize
 
-BEST_MODEL = "best_model.zip"
+BEST_MODEL, BEST_STATISTICS = "best_model.zip", "best_model.vecnormalize.pkl"
 
 
 class RegretCallback(BaseCallback):
@@ -41,7 +41,7 @@ class RegretCallback(BaseCallback):
             task: a name in `TASKS`, or a Task that has a certified set: the one to be judged by, also where training makes it
                 easier.
             eval_freq: control steps of each env between two evaluations. One is made at the end of training as well.
-            save_path: folder of best_model.zip, with best_model.vecnormalize.npz where the model has statistics, and of
+            save_path: folder of best_model.zip, with best_model.vecnormalize.pkl where the model has statistics, and of
                 evaluations.csv; None: nothing is written.
             validation_episodes: how many fresh episodes choose the best model.
             robot: a name in `ROBOTS`.
@@ -99,8 +99,8 @@ class RegretCallback(BaseCallback):
             self.model.save(model)
             files.write(folder / BEST_MODEL, model.getvalue())
             statistics = self.model.get_vec_normalize_env()
-            if statistics is not None:
-                save_vecnormalize(statistics, folder / BEST_MODEL)
+            if statistics is not None:  # as VecNormalize.load reads it
+                files.write(folder / BEST_STATISTICS, pickle.dumps(statistics))
 
 
 def _order(figures: dict[str, float]) -> tuple[float, float]:
