@@ -1,11 +1,44 @@
 """PPO of RLlib on a ballbot with several env runners, on this machine or a cluster, measured by the regret of its policy.
 
-Needs `pip install "ballbot-gym[rllib]"`, which installs an older Gymnasium.
+Needs `pip install "ballbot-gym[rllib]"`, which installs an older Gymnasium: RLlib pins it, and both work with it.
 """
 
 import time
+from typing import Any
 
+import gymnasium
+import numpy as np
 import tyro
+
+
+def make(settings: Any) -> gymnasium.Env:
+    """The environment on whichever machine an env runner works; `env_config` holds keywords of `gymnasium.make`."""
+    return gymnasium.make(**{"physics": "rk4", **settings})
+
+
+class RllibPolicy:
+    """The deterministic policy of an algorithm, for `evaluate` and `evaluate_fresh`.
+
+    Checkpoints of RLlib hold pickles, which run code when they are read. `Algorithm.from_checkpoint` reads one that you
+    trust.
+    """
+
+    def __init__(self, trained: Any):
+        """Args: trained: an algorithm of RLlib's present API."""
+        self._module = trained.get_module()
+        self._distribution = self._module.get_inference_action_dist_cls()
+        self.observation_space, self.action_space = self._module.observation_space, self._module.action_space
+
+    def predict(self, observation: np.ndarray, *_: object, **__: object) -> tuple[np.ndarray, None]:
+        """Actions (..., 2) in [−1, 1] for observations (..., no)."""
+        import torch
+        from ray.rllib.core.columns import Columns
+
+        batch = np.atleast_2d(np.asarray(observation, np.float32))
+        with torch.no_grad():
+            made = self._module.forward_inference({Columns.OBS: torch.as_tensor(batch)})
+            action = self._distribution.from_logits(made[Columns.ACTION_DIST_INPUTS]).to_deterministic().sample()
+        return np.clip(action.numpy(), -1, 1).reshape(*np.shape(observation)[:-1], -1), None
 
 
 def main(
@@ -47,14 +80,14 @@ def main(
     import ray as cluster
     import torch
     from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.tune.registry import register_env
 
     from ballbot_gym.seeding import spawned
     from ballbot_gym.tasks import TASKS
     from ballbot_train import evaluate, evaluate_fresh
-    from ballbot_train.rllib import RllibPolicy, register
 
     torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work
-    register()
+    register_env("ballbot", make)
     if not cluster.is_initialized():
         small = (
             {} if ray else {"num_cpus": env_runners + 1, "object_store_memory": 200 * 2**20, "include_dashboard": False}
@@ -62,7 +95,7 @@ def main(
         cluster.init(ray or "local", log_to_driver=False, logging_level="ERROR", **small)
     settings = (
         PPOConfig()
-        .environment(TASKS[task].id, env_config={})
+        .environment("ballbot", env_config={"id": f"ballbot_gym:{TASKS[task].id}"})
         .env_runners(num_env_runners=env_runners, num_envs_per_env_runner=envs_per_runner, num_cpus_per_env_runner=1)
         .training(
             train_batch_size_per_learner=batch,

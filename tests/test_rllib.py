@@ -16,7 +16,6 @@ def test_ppo_with_two_env_runners_is_measured_by_its_regret(capsys, tmp_path):
     from ray.rllib.algorithms.algorithm import Algorithm
 
     from ballbot_gym.env import BallbotEnv
-    from ballbot_train.rllib import RllibPolicy
 
     spec = importlib.util.spec_from_file_location(
         "train_rllib", Path(__file__).parent.parent / "examples" / "train_rllib.py"
@@ -30,7 +29,7 @@ def test_ppo_with_two_env_runners_is_measured_by_its_regret(capsys, tmp_path):
     assert re.search(r"certified episodes: success .*, mean regret", capsys.readouterr().out)
     observation = BallbotEnv("stabilize", physics="rk4").reset(seed=0)[0]
     algorithm = Algorithm.from_checkpoint(str(saved))
-    policy = RllibPolicy(algorithm)
+    policy = example.RllibPolicy(algorithm)
     action, _ = policy.predict(observation)
     assert action.shape == (2,)
     batch, _ = policy.predict(np.stack([observation, 2 * observation]))
