@@ -48,8 +48,8 @@ class Robot:
 
 @dataclass(frozen=True)
 class GroundPath:
-    """A line on the floor through points (n, 2), m: where a robot was, dashed where it plans to go. Its colour is as of a
-    robot or as of a marker.
+    """A line on the floor through points (n, 2), m: where a robot was, or dashed, a ring. Its colour is as of a robot or
+    as of a marker.
     """
 
     points: np.ndarray

@@ -12,7 +12,6 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.policy_files import BEST, SHIPPED
 
@@ -64,21 +63,6 @@ def test_an_episode_without_pushes_costs_what_the_env_says(play, robot, physics,
     assert score.regret == pytest.approx(score.cost / best - 1, nan_ok=True)
 
 
-def test_the_optimum_of_a_certified_episode_is_known_as_it_goes(play):
-    playground = play()
-    assert playground.optimum_cost_so_far == 0
-    go(playground, 1.0)
-    early = playground.optimum_cost_so_far
-    assert 0 < early < playground.optimum_cost
-    go(playground, 6.9)
-    assert playground.optimum_cost_so_far == pytest.approx(
-        certified.load("stabilize", "paper").costs[STANDING], rel=1e-6
-    )
-    playground.begin(150)  # one whose trajectory is not kept
-    assert math.isnan(playground.optimum_cost_so_far)
-    assert playground.optimum_cost > 0
-
-
 def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play):
     playground = play(controller=None, ghosts=["lqr"], episode="rest")
     assert playground.main.name == BEST["stabilize"]
@@ -125,7 +109,7 @@ def test_controllers_change_without_a_jump(play):
         playground.step()
         assert playground.main.name == name
         assert np.abs(np.subtract(playground.main.x, before)[:2]).max() < 0.02 * 8  # m: at less than 8 m/s
-    assert len(playground.trajectory().u) == 28  # one episode all along
+    assert len(playground.main.forces) == 28  # one episode all along
 
 
 def test_after_a_fall_the_same_episode_begins_again(play):
@@ -161,6 +145,7 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     np.testing.assert_array_equal(playground.main.controller.act(0.0, np.ones(8)), gain)
     playground.step()
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
+    assert math.isnan(playground.optimum_cost)  # which is of the robot that everybody knows
 
 
 def test_every_episode_of_a_track_has_a_robot_of_its_own(play):
@@ -186,17 +171,14 @@ def test_another_task_or_robot_keeps_the_controllers_that_it_has(play):
     assert playground.world.task_name == "orbit"
 
 
-def test_a_policy_file_is_offered_where_it_fits(play, tmp_path):
+def test_a_policy_file_becomes_a_controller_that_can_be_chosen(play, tmp_path):
     for file in SHIPPED.glob("stabilize-ppo.*"):
         shutil.copy(file, tmp_path / f"mine{file.suffix}")
-    playground, mine = play(), str(tmp_path / "mine.json")
-    playground.set_controller(mine)
+    mine = str(tmp_path / "mine.json")
+    playground = play(controller=mine)
     playground.step()
     assert playground.main.name == mine
     assert playground.notice == ""
-    playground.set_world("orbit")
-    assert mine not in playground.world.controllers
-    playground.set_world("stabilize")
     assert mine in playground.world.controllers
 
 
@@ -255,12 +237,3 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     playground = play(controller="trajopt")
     assert playground.main.name == "lqr"
     assert "LQR does instead: no way" in playground.notice
-
-
-def test_what_happened_can_be_saved(play, tmp_path):
-    playground = play()
-    with pytest.raises(ValueError, match="nothing to save"):
-        playground.trajectory()
-    go(playground, 0.5)
-    path = playground.trajectory().save(tmp_path / "played.npz")
-    np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)

@@ -36,7 +36,6 @@ class Visitor:
 
     def __init__(self, port, **headers):
         self.controls = {}
-        self.files = {}
         self._labels = {}
         self._node = ""
         self.connection = connect(
@@ -114,5 +113,3 @@ class Visitor:
             self.controls[self._labels[uuid]].update(message["updates"])
         elif kind == "SetSceneNodeDragBindingsMessage" and message["bindings"]:
             self._node = message["name"]
-        elif kind == "FileTransferStartDownload":
-            self.files[message["filename"]] = message["size_bytes"]

@@ -70,7 +70,6 @@ class NmpcController:
     | attribute | meaning |
     |---|---|
     | `plan` | the episode's plan; None before the first `reset`, which raises a PlanError where there is no plan |
-    | `predicted` | (nodes + 1, 8) states of the last solution; None before the first `act` and after the plan's end |
     | `disturbance` | the estimate of how the robot differs from the model, if `offset_free`; else None |
     | `backoff` | how far its plans keep from their limits |
     | `counts` | what happened so far |
@@ -108,7 +107,6 @@ class NmpcController:
         self._offsets, self._shift_states, self._shift_inputs = grid(steps, nodes)
         self._qp = horizon_qp(task, RobotKind.of(params), nodes)
         self.plan: Optimum | None = None
-        self.predicted: np.ndarray | None = None
         self.disturbance: DisturbanceEstimator | None = None
         self.counts = Counts()
 
@@ -131,7 +129,7 @@ class NmpcController:
         """
         task, robot = self._task, self._params
         plan = plan_to_track(task, robot, x, c, self.backoff, t)
-        self._start, self.plan, self.predicted = t, plan, None
+        self._start, self.plan = t, plan
         self._trajectory = trajectory = plan.trajectory
         self._tracker = TvlqrController.for_task(task, robot, trajectory, c)
         self._tracker.reset(t, trajectory.x[0], c)
@@ -158,11 +156,9 @@ class NmpcController:
             elapsed = 0
         if elapsed >= self._length:
             u = self._tracker.act(t, x)  # the plan's end is held
-            self.predicted = None
         else:
             self._advance(elapsed)
             u = limit * self._qp.a[0] if self._solve(x) else self._fall_back(x)
-            self.predicted = self._x_plan + self._dx
         u = np.clip(u, -limit, limit)
         self._before = x, u
         return u

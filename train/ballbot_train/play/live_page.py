@@ -11,14 +11,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from ballbot_gym import certified, dynamics, files
+from ballbot_gym import certified, dynamics
 from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.robots import without_wheels
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.console import markdown_text
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Playground, Start
+from ballbot_train.play.simulation import PLANT, Playground, Start
 from ballbot_train.report import labels
 
 PATIENCE = 0.1
@@ -26,10 +26,8 @@ PATIENCE = 0.1
 _DRAW_HZ, _TEXT_HZ = 30.0, 4.0
 _IDLE = 0.1  # s, between two looks while nobody is there
 _SLOWEST, _FASTEST = 0.1, 2.0  # simulated seconds per second
-_SCORES_SHOWN = 8
 _NOTICE_LENGTH = 300
 _HELP = "Drag the robot and let go: every robot gets the same push."
-_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip), where the simulation runs"
 
 
 class PlayPage:
@@ -107,83 +105,57 @@ class PlayPage:
     def _build(self) -> None:
         gui, playground = self._gui, self.playground
         self._status = gui.add_markdown("")
-        tabs = gui.add_tab_group()
-        with tabs.add_tab("Play"):
-            self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_world, lambda: playground.world.task_name)
-            self._bind(
-                gui.add_dropdown("Robot", without_wheels()),
-                lambda robot: playground.set_world(robot=robot),
-                lambda: playground.world.robot,
-            )
-            self._controller = gui.add_dropdown("Controller", ("lqr",))
-            self._bind(self._controller, playground.set_controller, lambda: playground.main.name)
-            file = gui.add_text("Policy file", "", hint=_FILE_HINT)
-            self._button("Use the policy file", lambda: playground.set_controller(file.value))
-            self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
-            self._build_time()
-            self._build_push()
-        with tabs.add_tab("Change"), gui.add_folder("What the controllers do not know"):
+        self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_world, lambda: playground.world.task_name)
+        self._bind(
+            gui.add_dropdown("Robot", without_wheels()),
+            lambda robot: playground.set_world(robot=robot),
+            lambda: playground.world.robot,
+        )
+        self._controller = gui.add_dropdown("Controller", ("lqr",))
+        self._bind(self._controller, playground.set_controller, lambda: playground.main.name)
+        self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
+        with gui.add_folder("What the controllers do not know", expand_by_default=False):
             for stress, (label, low, high, step) in PLANT.items():
                 slider = gui.add_slider(label, low, high, step, 0.0, hint=STRESSES[stress].label)
                 self._bind(slider, partial(playground.set_plant, stress), partial(playground.plant.get, stress))
-            self._button(
-                "All as the controllers believe", lambda: [playground.set_plant(stress, 0.0) for stress in PLANT]
-            )
-        with tabs.add_tab("Scores"):
-            save = gui.add_button("Save the episode so far", hint="a trajectory file, for ballbot replay")
-            save.on_click(self._asking(lambda client, _: self._save(client)))
-            self._scores = gui.add_markdown("")
+            told = gui.add_button("All as the controllers believe")
+            told.on_click(self._asking(lambda _: [playground.set_plant(stress, 0.0) for stress in PLANT]))
+        self._build_time()
         self._refresh()
 
     def _build_time(self) -> None:
         gui, playground = self._gui, self.playground
         with gui.add_folder("Time"):
-            actions = {"Play / pause": self._toggle, "Step": self._step, "Restart": playground.restart}
-            actions["Random"] = partial(playground.begin, "random")
+            actions = {
+                "Play / pause": ("space", self._toggle),
+                "Restart": ("R", playground.restart),
+                "Random": ("N", partial(playground.begin, "random")),
+            }
             group = gui.add_button_group(" ", tuple(actions), hint="keys: space, R and N")
-            group.on_click(self._asking(lambda _, button: actions[button]()))
+            group.on_click(self._asking(lambda button: actions[button][1]()))
             self.speed = gui.add_slider("Speed", _SLOWEST, _FASTEST, step=0.1, initial_value=1.0)
             episodes: dict[str, Start] = {"rest": "rest", "random": "random"}
             episodes |= {str(i): i for i in range(certified.EPISODES)}
             shown = gui.add_dropdown("Episode", tuple(episodes))
             self._bind(shown, lambda name: playground.begin(episodes[name]), lambda: str(playground.episode))
-        self._key("pause or play", "space", self._toggle)
-        self._key("restart", "R", playground.restart)
-        self._key("random start", "N", partial(playground.begin, "random"))
-
-    def _build_push(self) -> None:
-        with self._gui.add_folder("Push"):
-            impulse = self._gui.add_slider("N·s", 0.0, LARGEST_PUSH, 5.0, 90.0)
-            bearing = self._gui.add_slider("Direction, °", 0.0, 360.0, 5.0, 0.0, hint="from the x axis")
-
-            def push() -> None:
-                along = math.radians(bearing.value)
-                self.playground.push(impulse.value * math.cos(along), impulse.value * math.sin(along))
-
-            self._button("Push", push, hint="key: P; or drag the robot and let go")
-            self._key("push", "P", push)
+        for label, (key, action) in actions.items():
+            gui.add_command(label, hotkey=key).on_trigger(self._asking(lambda _, action=action: action()))
 
     def _bind(self, control: Any, apply: Callable[[Any], object], read: Callable[[], Any]) -> None:
         """Lets a control change the playground. What is refused goes back to what `read` says."""
-        control.on_update(self._asking(lambda _, value: apply(value)))
+        control.on_update(self._asking(apply))
         self._bound.append((control, read))
 
-    def _button(self, label: str, action: Callable[[], object], hint: str | None = None) -> None:
-        self._gui.add_button(label, hint=hint).on_click(self._asking(lambda *_: action()))
-
-    def _key(self, label: str, key: Any, action: Callable[[], object]) -> None:
-        self._gui.add_command(label, hotkey=key).on_trigger(self._asking(lambda *_: action()))
-
-    def _asking(self, action: Callable[[Any, Any], object]) -> Any:
-        """A callback of viser that asks for something, by viser's client and the value that the control has got.
+    def _asking(self, action: Callable[[Any], object]) -> Any:
+        """A callback of viser that asks for something, by the value that the control has got.
 
         It is a coroutine of viser's loop, so that callbacks come in the order of the changes.
         """
 
         async def asked(event: Any) -> None:
-            client, value = event.client, getattr(event.target, "value", None)
+            value = getattr(event.target, "value", None)
             if event.client_id is not None:  # not set by this program
-                self._requests.put(lambda: action(client, value))
+                self._requests.put(lambda: action(value))
 
         return asked
 
@@ -203,27 +175,15 @@ class PlayPage:
             if control.value != (value := read()):
                 control.value = value
         self._status.content = self._text()
-        scores = reversed(playground.scores[-_SCORES_SHOWN:])
-        self._scores.content = "\n".join(f"- {markdown_text(score.text)}" for score in scores)
 
     # --- what they do ---
 
-    def _set_ghost(self, name: str, _: Any, wanted: bool) -> None:
+    def _set_ghost(self, name: str, wanted: bool) -> None:
         others = [ghost for ghost in self.playground.ghosts if ghost != name]
         self.playground.set_ghosts([*others, name] if wanted else others)
 
     def _toggle(self) -> None:
         self.paused = not self.paused
-
-    def _step(self) -> None:
-        self.paused = True
-        self.playground.step()
-
-    def _save(self, client: Any) -> None:
-        """Hands viser's client the trajectory of the episode so far."""
-        episode, name = self.playground.trajectory(), f"{self.playground.world.task_name}.npz"
-        content = files.npz({"t": episode.t, "x": episode.x, "u": episode.u})
-        client.send_file_download(name, content, save_immediately=True)
 
     # --- words ---
 
@@ -236,12 +196,10 @@ class PlayPage:
         """What goes on."""
         playground, main = self.playground, self.playground.main
         status = f"{labels.label(main.name)}, {playground.seconds:.1f} s of {playground.world.task.duration:g} s"
-        if playground.ended:
-            status = playground.scores[-1].text
         cost = f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, cost {main.cost:.2f}"
         if math.isfinite(best := playground.optimum_cost):
-            now = playground.optimum_cost_so_far
-            cost += f", the optimum's {best:.2f}" if math.isnan(now) else f", the optimum's {now:.2f} of {best:.2f}"
+            cost += f", the optimum's {best:.2f}"
         lines = [f"**{markdown_text(status)}**", cost, *["paused"] * self.paused]
+        lines += [markdown_text(score.text) for score in playground.scores[-1:]]
         lines.append(f"*{markdown_text(playground.notice[:_NOTICE_LENGTH])}*" if playground.notice else _HELP)
         return "  \n".join(lines)

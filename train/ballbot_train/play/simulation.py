@@ -22,11 +22,10 @@ from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.trajectory import Trajectory
 from ballbot_train.console import check_names
-from ballbot_train.evaluation.controllers import is_expert, is_file, is_made_for, make_controller, names
+from ballbot_train.evaluation.controllers import is_expert, make_controller, names
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.policy_files import BEST, PolicyError
+from ballbot_train.policy_files import BEST
 from ballbot_train.report import labels
 
 LARGEST_PUSH = 250.0
@@ -39,8 +38,6 @@ _FIRST_PUSH_AFTER = 1.0  # s
 _PAUSE = 1.5  # s, between the end of a robot and its next episode
 _PUSH_SHOWN = 0.3  # s, for which a push is drawn
 _TRACE_STEPS = 400  # control steps that the trace on the floor goes back
-_PLAN_POINTS = 60  # of a drawn plan
-
 
 Start = int | Literal["rest", "random"]
 """The index of a certified episode, one that stands at the origin until it is pushed, or one with another start."""
@@ -60,8 +57,8 @@ step. 0 is nothing."""
 class World:
     """A task for a robot, and what can be chosen there."""
 
-    def __init__(self, task: str, robot: str, files: Iterable[str] = ()):
-        """A task and a robot by name, and policy files, of which those are offered that are made for both.
+    def __init__(self, task: str, robot: str):
+        """A task and a robot by name.
 
         Raises:
             ValueError: an unknown task or robot, or a robot with wheels.
@@ -76,9 +73,6 @@ class World:
         experts = [name for name in known if is_expert(name)]
         self.controllers = [*experts, "nmpc-offset-free", *(name for name in known if name not in experts)]
         """What can be chosen, experts first."""
-        for file in files:
-            with contextlib.suppress(PolicyError):  # a file that is gone by now
-                self.controllers += [file] * is_made_for(file, self.task, robot)
         best = BEST.get(task, "")
         self.best = best if best in known else "nmpc"
         """The controller to begin with: the shipped policy with the least regret, or else NMPC."""
@@ -155,16 +149,6 @@ class Runner:
         self.violated = self.env.limit_names[info["violated"]] if info["failure"] else ""
         self.arrived = terminated and info["success"]
 
-    def plan(self, seconds: float) -> np.ndarray:
-        """(n, 2) where its controller plans to go from that time of the episode on, m; none if it does not plan."""
-        predicted, plan = getattr(self.controller, "predicted", None), getattr(self.controller, "plan", None)
-        if predicted is not None:
-            return predicted[:, :2]
-        if plan is None or hasattr(self.controller, "predicted"):
-            return np.zeros((0, 2))
-        rest = plan.trajectory.x[plan.trajectory.t >= seconds]
-        return rest[:: max(1, len(rest) // _PLAN_POINTS), :2]
-
 
 class Score(NamedTuple):
     """How an episode of the main robot ended."""
@@ -173,17 +157,14 @@ class Score(NamedTuple):
     seconds: float
     cost: float
     regret: float
-    """Cost over the optimum's, less 1; NaN without an optimum. Pushes and hidden changes count: the optimum had none."""
+    """Cost over the optimum's, less 1; NaN without an optimum. Pushes count: the optimum had none."""
     failure: str
     """The violated limit, or ""."""
-    changed: bool = False
-    """Whether something was hidden from the controllers, and from the optimum."""
 
     @property
     def text(self) -> str:
         """In words."""
-        of = " to the optimum of the unchanged robot" * self.changed
-        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %{of}"
+        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %"
         if self.failure:
             return f"{self.controller}: {_failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
         return f"{self.controller}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
@@ -234,7 +215,6 @@ class Playground:
         self.notice = ""
         """What went wrong last, in words."""
         self.episode: Start = episode
-        self._files: list[str] = []
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
         self._physics = default_physics() if physics is None else physics
@@ -265,36 +245,15 @@ class Playground:
 
     @property
     def optimum_cost(self) -> float:
-        """The best cost of the certified episode without pushes; NaN of other starts."""
+        """The best cost of the certified episode without pushes; NaN of other starts and of a changed robot."""
         known, i = self.world.certified, self.episode
-        return math.nan if known is None or isinstance(i, str) else float(known.costs[i])
-
-    @property
-    def optimum_cost_so_far(self) -> float:
-        """What the optimum has cost until now; NaN where its trajectory is not kept."""
-        known, i = self.world.certified, self.episode
-        if known is None or isinstance(i, str) or i >= len(known.trajectories):
-            return math.nan
-        task, best = self.world.task, known.trajectories[i]
-        n = min(self.elapsed, len(best.u))
-        c = task.at(tuple(self.start[1].tolist()), best.t[:n])
-        return task.control_dt * float(np.sum(task.cost(tuple(best.x[:n].T), tuple(best.u[:n].T), c)))
+        changed = any(self.plant.values()) or self._track.active
+        return math.nan if known is None or isinstance(i, str) or changed else float(known.costs[i])
 
     @property
     def shown_push(self) -> np.ndarray | None:
         """(2,) the push that is drawn, N·s; None if there was none lately."""
         return self._push if self.elapsed < self._push_until else None
-
-    def trajectory(self) -> Trajectory:
-        """The main robot's episode so far.
-
-        Raises:
-            ValueError: it has not begun.
-        """
-        if not self.main.forces:
-            raise ValueError("the episode has not begun: there is nothing to save")
-        times = self.world.task.control_dt * np.arange(len(self.main.states))
-        return Trajectory(times, np.array(self.main.states), np.array(self.main.forces))
 
     def drawing(self) -> Drawing:
         """The present moment."""
@@ -308,9 +267,6 @@ class Playground:
             robots.append(Robot(np.array(runner.x), colors[i], force, alpha, push, label))
             trace = np.array(runner.states[-_TRACE_STEPS:])[:, :2]
             paths += [GroundPath(trace, colors[i])] * (len(trace) > 1)
-        plan = main.plan(self.seconds)
-        if len(plan) > 1 and not main.violated and not self.ended:
-            paths.append(GroundPath(plan, colors[0], dashed=True))
         return Drawing(self.world.params, tuple(robots), tuple(paths), tuple(self.world.task.markers(self.start[1])))
 
     # --- time ---
@@ -355,7 +311,7 @@ class Playground:
 
     def set_world(self, task: str | None = None, robot: str | None = None) -> None:
         """Another task, or another robot, under the same controllers where they are made for it."""
-        world = World(task or self.world.task_name, robot or self.world.robot, self._files)
+        world = World(task or self.world.task_name, robot or self.world.robot)
         main = self.main.name if self.main.name in world.controllers else world.best
         self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)], 0)
 
@@ -423,9 +379,8 @@ class Playground:
         """A controller by name, which is offered from then on."""
         self.announce(f"preparing {labels.label(name)} … the first time in a task, solvers are compiled")
         controller = make_controller(name, world.task, world.params)
-        if name not in world.controllers:
+        if name not in world.controllers:  # a file
             world.controllers.append(name)
-            self._files += [name] * is_file(name)
         return controller
 
     def _ready(self, name: str) -> Controller:
@@ -466,10 +421,8 @@ class Playground:
     def _end(self) -> None:
         """Notes the score. The same episode begins again after a pause; if only time is over, another where the robot is."""
         task, main = self.world.task, self.main
-        changed = any(self.plant.values()) or self._track.active
         regret = main.cost / self.optimum_cost - 1
-        score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated, changed)
-        self.scores.append(score)
+        self.scores.append(Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated))
         if task.first_exit or main.stands_still:
             self._pause_left = round(_PAUSE / task.control_dt)
         else:
