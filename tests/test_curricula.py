@@ -84,12 +84,13 @@ def test_a_wide_goal_is_reached_by_who_misses_the_gate_by_less_than_it():
 
 def test_the_goal_narrows_and_then_the_speed_rises_whenever_enough_episodes_succeed(constants):
     constants(GOAL_FACTOR=1.5, GOAL_STEP=0.8, RAMPS={"max_speed": (9.85, 0.1)}, EPISODES=4, REACH=1.0)
-    made = backwards()
-    made._on_optima.share = 1.0
+    made = backwards(num_envs=4)
+    made._shares = {0: 0.0, 1: 1.0}
     reached = []
     for won in (2, 3, 4, 4, 4, 4):
         flags = torch.arange(4) < won
-        made._count(torch.ones(4, dtype=torch.bool), flags)
+        if made._count(0, torch.ones(4, dtype=torch.bool), flags):
+            made._harden()
         reached.append((made.difficulty["goal_factor"], made.difficulty["max_speed"], made.task.max_speed))
     assert [factor for factor, *_ in reached] == pytest.approx([1.5, 1.2, 1.0, 1.0, 1.0, 1.0])
     assert [speed for _, speed, _ in reached] == pytest.approx([9.85, 9.85, 9.85, 9.95, 10.0, 10.0])

@@ -18,7 +18,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -52,37 +52,9 @@ _EARLY_FAILURE_PRICE = 300.0  # while the curriculum lasts: it teaches not to fa
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
 _STATE = (
-    *("_goal_factor", "_ramp", "_reach", "_has_settled", "_own_episodes", "_on_optima"),
+    *("_goal_factor", "_ramp", "_reach", "_has_settled", "_counts", "_shares"),
     *("_kind", "_again", "_begun", "_hard", "_starts"),
 )
-
-
-@dataclass
-class _Tally:
-    """Episodes that ended."""
-
-    ended: int = 0
-    """Since they were last looked at."""
-    succeeded: int = 0
-    """Of these."""
-    share: float = math.nan
-    """Of successes, when they were last looked at."""
-
-    def state_dict(self) -> dict[str, float]:
-        return dict(vars(self))
-
-    def load_state_dict(self, state: Mapping[str, float]) -> None:
-        vars(self).update(state)
-
-    def add(self, ended: torch.Tensor, success: torch.Tensor) -> bool:
-        """Counts episodes. True where there are enough to look at; their share of successes is then new."""
-        self.ended += int(ended.sum())
-        self.succeeded += int((ended & success).sum())
-        if self.ended < _EPISODES:
-            return False
-        self.share = self.succeeded / self.ended
-        self.ended = self.succeeded = 0
-        return True
 
 
 class CurriculumBatch(BallbotBatch):
@@ -133,7 +105,9 @@ class CurriculumBatch(BallbotBatch):
         ramps = {name: start for name, (start, _) in _RAMPS.items() if backwards and hasattr(task, name)}
         self._ramp = {name: min(start, getattr(task, name)) for name, start in ramps.items()}
         self._reach = _REACH
-        self._own_episodes, self._on_optima = _Tally(), _Tally()  # that ended, by how they began
+        # by how they began: the episodes that ended since they were last looked at and those of them that succeeded; and the
+        # share of successes when they were
+        self._counts, self._shares = {_OWN: (0, 0), _ON_OPTIMUM: (0, 0)}, {_OWN: math.nan, _ON_OPTIMUM: math.nan}
         self._has_settled = not backwards  # whether enough episodes of the task itself have succeeded
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
@@ -149,7 +123,7 @@ class CurriculumBatch(BallbotBatch):
         """How far the curriculum has come, by name; empty without one."""
         if not self.backwards:
             return {}
-        shares = {"starts_success": self._on_optima.share, "success": self._own_episodes.share}
+        shares = {"starts_success": self._shares[_ON_OPTIMUM], "success": self._shares[_OWN]}
         return {"goal_factor": self._goal_factor, **self._ramp, "starts_seconds": self._reach, **shares}
 
     @property
@@ -206,8 +180,11 @@ class CurriculumBatch(BallbotBatch):
     def _go_backwards(self, result: BatchStep, ended: torch.Tensor) -> BatchStep:
         """Counts what ended, makes the task harder, and chooses where the next episodes begin."""
         counted = ended & ~self._again
-        self._count(counted & (self._kind == _OWN), result.success)
-        self._count_starts(counted & (self._kind == _ON_OPTIMUM), result.success)
+        if self._count(_OWN, counted, result.success):
+            self._harden()
+        if self._count(_ON_OPTIMUM, counted, result.success) and self._shares[_ON_OPTIMUM] >= _SUCCESS:
+            self._reach = min(self._reach + _REACH_STEP, self.own_task.duration)  # they begin earlier from now on
+            self._eligible = None
         self._keep_hard(result)
         self._kind, self._again = torch.where(ended, _OWN, self._kind), self._again & ~ended
         began = self.state
@@ -220,28 +197,21 @@ class CurriculumBatch(BallbotBatch):
         observation = torch.where(ended[:, None], self.observe(self.state), result.observation)
         return result._replace(observation=observation)
 
-    def _count(self, ended: torch.Tensor, success: torch.Tensor) -> None:
-        """Counts the episodes that ended, and makes the task harder if enough of them succeeded."""
-        tally = self._own_episodes
-        if not tally.add(ended, success):
-            return
-        if not self._is_easier:
-            self._has_settled |= tally.share >= _SETTLED_SUCCESS
-        if tally.share >= _SUCCESS and (self._optima_succeed or self._goal_factor == 1):
-            self._harden()
-
-    def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
-        """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
-        enough = self._on_optima.add(ended, success) and self._on_optima.share >= _SUCCESS
-        if enough and self._reach < self.own_task.duration:
-            self._reach = min(self._reach + _REACH_STEP, self.own_task.duration)
-            self._eligible = None
+    def _count(self, kind: int, ended: torch.Tensor, success: torch.Tensor) -> bool:
+        """Counts the episodes of a kind that ended. True where there are enough to look at; their share is then new."""
+        ended = ended & (self._kind == kind)
+        before, won = self._counts[kind]
+        count, won = before + int(ended.sum()), won + int((ended & success).sum())
+        enough = count >= _EPISODES
+        self._shares = self._shares | ({kind: won / count} if enough else {})
+        self._counts = self._counts | {kind: (0, 0) if enough else (count, won)}
+        return enough
 
     @property
     def _optima_succeed(self) -> bool:
         """Whether episodes begin anywhere on optima, and enough of them succeed for a narrower goal."""
         longest = math.inf if self._starts is None else float(self._starts[-1].max()) * self.task.control_dt
-        return self._reach >= min(longest, self.own_task.duration) and self._on_optima.share >= _OPTIMA_SUCCESS
+        return self._reach >= min(longest, self.own_task.duration) and self._shares[_ON_OPTIMUM] >= _OPTIMA_SUCCESS
 
     @property
     def _is_easier(self) -> bool:
@@ -249,14 +219,15 @@ class CurriculumBatch(BallbotBatch):
         return self._goal_factor > 1 or any(value != getattr(self.own_task, name) for name, value in self._ramp.items())
 
     def _harden(self) -> None:
-        """Takes a step towards the task itself: the goal first, then the fields."""
+        """Takes a step towards the task itself if enough of its episodes succeed: the goal first, then the fields."""
+        share = self._shares[_OWN]
         if not self._is_easier:
-            return
-        if self._goal_factor > 1:
+            self._has_settled |= share >= _SETTLED_SUCCESS
+        elif share >= _SUCCESS and self._goal_factor == 1:
+            steps = {name: reached + _RAMPS[name][1] for name, reached in self._ramp.items()}
+            self._ramp = {name: min(value, getattr(self.own_task, name)) for name, value in steps.items()}
+        elif share >= _SUCCESS and self._optima_succeed:
             self._goal_factor = max(1.0, self._goal_factor * _GOAL_STEP)
-        else:
-            for name, reached in self._ramp.items():
-                self._ramp[name] = min(reached + _RAMPS[name][1], getattr(self.own_task, name))
         self._set_difficulty()
 
     def _set_difficulty(self) -> None:
@@ -305,7 +276,7 @@ class CurriculumBatch(BallbotBatch):
     @property
     def _retried_share(self) -> float:
         """The share of the episodes that repeats starts."""
-        wrong = 1 - self._own_episodes.share
+        wrong = 1 - self._shares[_OWN]
         return min(_RETRIES, _RETRIES_PER_FAILURE * wrong) if self.is_settled and math.isfinite(wrong) else _RETRIES
 
     def _begin(self, begun: torch.Tensor) -> None:
