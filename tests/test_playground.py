@@ -253,16 +253,16 @@ def test_in_the_browser_a_robot_that_nobody_told_has_no_regret(opened):
     assert advance(opened, 50)[2][2][0] == "optimum"
 
 
-def test_buttons_and_keys_push_along_the_screen_and_a_drag_on_a_robot_pushes_it_that_way(opened):
+def test_keys_push_along_the_screen_and_a_drag_on_a_robot_pushes_it_that_way(opened):
     from selenium.webdriver import ActionChains, Keys
 
     opened.execute_script("playground.due = null; playground.draw(1)")
-    opened.find_element("css selector", "[aria-label='push to the right']").click()
+    view = opened.find_element("css selector", ".view")
+    view.send_keys(Keys.ARROW_RIGHT)
     speed = "const [x] = playground.robots.map(robot => robot.x); return x.slice(4, 6)"
     along = np.array(opened.execute_script("return playground.scene.right.slice(0, 2)"))
     assert np.array(opened.execute_script(speed)) @ along > 1
     opened.execute_script("playground.restart(playground.scenario.state); playground.setPlaying(false)")
-    view = opened.find_element("css selector", ".view")
     view.send_keys(Keys.ARROW_LEFT)
     assert np.array(opened.execute_script(speed)) @ along < -1
     opened.execute_script("playground.restart(playground.scenario.state); playground.setPlaying(false)")

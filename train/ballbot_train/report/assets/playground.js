@@ -1,50 +1,35 @@
 // The playground's page: scenarios, pushes and driving, pictures and readouts.
 "use strict";
 
-const find = (selector) => document.querySelector(selector);
 const DEGREES = 180 / Math.PI;
 const PUSH_SHOWN = 0.5; // s of the episode, for which a push's arrow stays
 const STRONGEST = 250; // N·s
+const BY_KEY = 90; // N·s, of a push
 const NEAR = 3.6; // m: the camera's distance from robots that are together
 const GRAB = 60; // px: how far from a robot's parts a drag still pushes it
 const THUMB = 70; // px of a drag that holds the stick fully out
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], a: [-1, 0], d: [1, 0], w: [0, 1], s: [0, -1] };
 
-class Playground {
+class Playground extends Player {
   constructor() {
-    try {
-      this.scene = new Scene(find(".view"), DATA);
-    } catch (error) {
-      find(".trouble").hidden = false;
-      find(".trouble").textContent = `The robots cannot be drawn: ${error.message}. The numbers below are computed all the same.`;
-    }
-    this.playing = true;
-    for (const chip of find(".chips").children) {
+    super(document);
+    this.scene = new Scene(this.find("view"), DATA);
+    for (const chip of this.find("chips").children) {
       chip.onclick = () => this.open(DATA.scenarios.findIndex(({ title }) => title === chip.textContent));
     }
-    find(".play").onclick = () => this.setPlaying(!this.playing);
-    find(".reset").onclick = () => this.open(this.index, this.driver !== null);
-    find(".episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
-    find(".drive").onclick = () => this.open(this.index, this.driver === null);
-    find(".impulse").oninput = () => (find(".strength output").textContent = `${this.impulse} N·s`);
-    for (const button of document.querySelectorAll(".pushes button")) {
-      button.onclick = () => this.pushOnScreen(Number(button.dataset.x), Number(button.dataset.y));
-    }
-    this.sliders = [...document.querySelectorAll(".unknown input")];
+    this.find("reset").onclick = () => this.open(this.index, this.driver !== null);
+    this.find("episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
+    this.find("drive").onclick = () => this.open(this.index, this.driver === null);
+    this.sliders = [...this.find("unknown").querySelectorAll("input")];
     for (const slider of this.sliders) slider.oninput = () => this.setRobot();
-    find(".told").onclick = () => this.setRobot(KNOWN);
-    find(".drawn").onclick = () => this.setRobot(this.sliders.map(({ min, max }) => (+min + Math.random() * (max - min)) / 100));
+    this.find("told").onclick = () => this.setRobot(KNOWN);
+    this.find("drawn").onclick = () => this.setRobot(this.sliders.map(({ min, max }) => (+min + Math.random() * (max - min)) / 100));
     this.listen();
     this.setRobot(KNOWN, 0);
-    everyFrame((seconds) => this.tick(seconds));
   }
 
   say(text) {
-    find(".said").textContent = text;
-  }
-
-  get impulse() {
-    return Number(find(".impulse").value);
+    this.find("said").textContent = text;
   }
 
   /** The robot's factors, from the sliders unless they are given, and the scenario anew. */
@@ -55,7 +40,7 @@ class Playground {
     });
     this.robot = this.sliders.map((slider) => Number(slider.value) / 100);
     this.isKnown = this.robot.every((factor) => factor === 1);
-    find(".told").disabled = this.isKnown;
+    this.find("told").disabled = this.isKnown;
     this.open(index, Boolean(this.driver));
   }
 
@@ -65,17 +50,14 @@ class Playground {
     this.index = index;
     this.scenario = DATA.scenarios[index];
     const { title, task } = this.scenario;
-    for (const chip of find(".chips").children) chip.setAttribute("aria-pressed", chip.textContent === title);
+    for (const chip of this.find("chips").children) chip.setAttribute("aria-pressed", chip.textContent === title);
     const same = [...DATA.scenarios.entries()].filter(([, scenario]) => scenario.title === title);
-    find(".episode").replaceChildren(...same.map(([i, { episode }]) => new Option(episode ?? "at rest", i, false, i === index)));
-    find(".text").textContent = driven
+    this.find("episode").replaceChildren(...same.map(([i, { episode }]) => new Option(episode ?? "at rest", i, false, i === index)));
+    this.find("text").textContent = driven
       ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture."
-      : this.scenario.text;
+      : `${this.scenario.text} Drag a robot to push it, or the floor to look around.`;
     this.say("");
-    find(".drive").setAttribute("aria-pressed", driven);
-    find(".pushes").hidden = find(".strength").hidden = driven;
-    find(".hint").textContent = driven ? "Drag anywhere: that is your stick." : "Drag a robot to push it. Drag the floor to look around.";
-    find(".hint").hidden = false;
+    this.find("drive").setAttribute("aria-pressed", driven);
     this.driver = driven ? new Driver() : null;
     this.held = new Set(); // keys
     this.robots = robotsOf(this.scenario, this.driver, this.robot);
@@ -89,17 +71,15 @@ class Playground {
     this.everyone.forEach((robot, i) => (robot.look = looks[i] ?? { ...DATA.best, alpha: DATA.ghost_opacity }));
     this.due = this.scenario.push; // the push that comes by itself
     this.restart(this.scenario.state);
-    [...find(".readouts tbody").rows].forEach((row, i) => {
+    [...this.find("readouts tbody").rows].forEach((row, i) => {
       row.hidden = i >= this.everyone.length;
       if (row.hidden) return;
       const { label, color } = this.everyone[i].look;
       row.cells[0].textContent = label;
-      for (const shown of [row, find(".names").children[i]]) shown.style.setProperty("--robot", color);
+      for (const shown of [row, this.find("names").children[i]]) shown.style.setProperty("--robot", color);
     });
-    if (this.scene) {
-      const [x, y] = this.scenario.state;
-      this.scene.camera.target = [x, y, 0.5];
-    }
+    const [x, y] = this.scenario.state;
+    this.scene.camera.target = [x, y, 0.5];
     this.setPlaying(true);
   }
 
@@ -110,11 +90,6 @@ class Playground {
     this.time = 0;
     this.late = 0; // s of the episode that are not computed yet
     this.shown = null; // the push whose arrow is shown: {impulse, until}
-  }
-
-  setPlaying(playing) {
-    this.playing = playing;
-    find(".play").textContent = playing ? "Pause" : "Play";
   }
 
   /** One control step of all robots. */
@@ -153,17 +128,13 @@ class Playground {
 
   /** What is along the screen, x to the right and y away from the camera, along the floor. */
   onFloor(x, y) {
-    const [right, back] = this.scene?.right ? [this.scene.right, this.scene.back] : [[1, 0], [0, -1]];
+    const { right, back } = this.scene;
     return Vector.plus(Vector.times(right.slice(0, 2), x), back.slice(0, 2), -y / Math.hypot(back[0], back[1]));
   }
 
-  pushOnScreen(x, y) {
-    this.hit(Vector.times(this.onFloor(x, y), this.impulse));
-  }
-
-  tick(elapsed) {
-    if (this.playing && !this.drag?.robot) {
-      this.late += elapsed * Number(find(".speed").value);
+  tick(seconds, elapsed) {
+    if (!this.drag?.robot) {
+      this.late += seconds;
       while (this.late >= DATA.dt) {
         this.late -= DATA.dt;
         this.advance();
@@ -181,7 +152,6 @@ class Playground {
   draw(elapsed) {
     const states = this.everyone.map((robot) => this.between(robot));
     this.showNumbers();
-    if (!this.scene) return;
     this.follow(states, elapsed);
     const pull = this.drag?.pull ?? (this.shown && this.time < this.shown.until ? this.shown.impulse : null);
     const robots = this.everyone.map((robot, i) => ({
@@ -214,7 +184,7 @@ class Playground {
       const near = (other) => place && other && Math.abs(other[1] - place[1]) < 24 && Math.abs(other[0] - place[0]) < 110;
       for (let clash; (clash = places.slice(0, i).find(near)); ) place[1] = clash[1] - 24;
     });
-    [...find(".names").children].forEach((name, i) => {
+    [...this.find("names").children].forEach((name, i) => {
       name.hidden = !places[i]; // of robots that there are not, too
       if (name.hidden) return;
       const robot = this.everyone[i];
@@ -227,7 +197,7 @@ class Playground {
   }
 
   showNumbers() {
-    const rows = find(".readouts tbody").rows;
+    const rows = this.find("readouts tbody").rows;
     this.everyone.forEach((robot, i) => {
       const force = robot.ended ? 0 : Math.hypot(...robot.force);
       const cells = [
@@ -258,22 +228,16 @@ class Playground {
 
   /** Pointers and keys. A drag that begins at a robot pushes, any other turns the camera; time stands still while one pulls. */
   listen() {
-    const view = find(".view");
+    const view = this.find("view");
     const place = (event) => [event.offsetX, event.offsetY];
     view.onpointerdown = (event) => {
-      if (!this.scene) return;
       const robot = this.driver ? null : this.robotAt(place(event));
       this.drag = { at: place(event), robot, pull: null };
       view.setPointerCapture(event.pointerId);
-      find(".hint").hidden = true;
       if (this.driver) this.showStick(this.drag.at, [0, 0]);
     };
     view.onpointermove = (event) => {
-      if (!this.scene?.matrix) return;
-      if (!this.drag) {
-        view.classList.toggle("over", !this.driver && this.robotAt(place(event)) !== null);
-        return;
-      }
+      if (!this.drag) return;
       const [x, y] = place(event);
       if (this.driver) {
         const held = shortened(Vector.times(Vector.minus([x, y], this.drag.at), 1 / THUMB), 1);
@@ -296,7 +260,7 @@ class Playground {
       if (along && this.driver) {
         this.held.add(event.key);
         this.steerByKeys();
-      } else if (along && event.key.length > 1) this.pushOnScreen(...along);
+      } else if (along && event.key.length > 1) this.hit(Vector.times(this.onFloor(...along), BY_KEY));
       else if (event.key === " ") this.setPlaying(!this.playing);
       else return;
       event.preventDefault();
@@ -311,14 +275,14 @@ class Playground {
 
   letGo() {
     this.drag = null;
-    find(".stick").hidden = true;
+    this.find("stick").hidden = true;
     if (this.driver) this.steer(0, 0);
   }
 
   showStick([x, y], [dx, dy]) {
-    find(".stick").hidden = false;
-    find(".stick").style.transform = `translate(${x}px, ${y}px)`;
-    find(".stick i").style.transform = `translate(${THUMB * dx}px, ${THUMB * dy}px)`;
+    this.find("stick").hidden = false;
+    this.find("stick").style.transform = `translate(${x}px, ${y}px)`;
+    this.find("stick i").style.transform = `translate(${THUMB * dx}px, ${THUMB * dy}px)`;
   }
 
   /** Holds the driver's stick along the screen: x to the right, y away from the camera. */
@@ -352,7 +316,7 @@ class Playground {
     const impulse = shortened(Vector.times(Vector.minus(to, from).slice(0, 2), 1 / DATA.push_scale), STRONGEST);
     const size = Math.hypot(...impulse);
     if (size < 3) return null;
-    find(".strength output").textContent = `${size.toFixed(0)} N·s`;
+    this.say(`a push of ${size.toFixed(0)} N·s`);
     return impulse;
   }
 }

@@ -12,19 +12,17 @@ function sample(take, dt, t) {
 
 const tiltOf = (gamma, theta) => (Math.acos(Math.min(1, Math.cos(gamma) * Math.cos(theta))) * 180) / Math.PI;
 
-class Replay {
+class Replay extends Player {
   constructor(root) {
+    super(root);
     this.root = root;
     root.replay = this;
     this.data = JSON.parse(root.querySelector("script").textContent);
-    [this.time, this.playing] = [0, false];
-    this.find = (name) => root.querySelector("." + name);
     this.chips = [...this.find("episodes").children];
     this.stages = [...this.find("stages").children].map((stage) => ({ stage, scene: this.scene(stage.querySelector("canvas")) }));
     this.chips.forEach((chip, index) => (chip.onclick = () => this.choose(index)));
-    this.find("play").onclick = () => (this.playing ? this.pause() : this.play());
     this.find("scrub").oninput = (event) => {
-      this.pause();
+      this.setPlaying(false);
       this.seek(Number(event.target.value));
     };
     window.addEventListener("resize", () => this.draw());
@@ -32,20 +30,24 @@ class Replay {
     this.choose(0);
   }
 
-  // What draws on a canvas, or null.
+  // What draws on a canvas. A drag turns every camera, so that robots can be compared.
   scene(canvas) {
-    try {
-      const scene = new Scene(canvas, this.data);
-      this.listen(canvas);
-      return scene;
-    } catch (error) {
-      canvas.replaceWith(`The robot cannot be drawn: ${error.message}`);
-      return null;
-    }
+    let last = null;
+    canvas.onpointerdown = (event) => {
+      last = event;
+      canvas.setPointerCapture(event.pointerId);
+    };
+    canvas.onpointermove = (event) => {
+      if (!canvas.hasPointerCapture(event.pointerId)) return;
+      for (const { scene } of this.stages) scene.turn(event.clientX - last.clientX, event.clientY - last.clientY);
+      last = event;
+      this.draw();
+    };
+    return new Scene(canvas, this.data);
   }
 
   choose(index) {
-    this.pause();
+    this.setPlaying(false);
     this.episode = this.data.episodes[index];
     this.chips.forEach((chip, n) => chip.setAttribute("aria-pressed", n === index));
     const { takes, dt } = this.episode;
@@ -59,26 +61,10 @@ class Replay {
       label.textContent = take.label;
       label.style.setProperty("--robot", take.color);
       stage.querySelector(".note").textContent = take.note;
-      scene?.canvas.setAttribute("aria-label", `${take.label} in 3D; drag to turn the camera of every picture`);
+      scene.canvas.setAttribute("aria-label", `${take.label} in 3D; drag to turn the camera of every picture`);
     });
     this.seek(this.episode.poster);
     this.root.dataset.ready = "true";
-  }
-
-  // A drag turns every camera, so that robots can be compared.
-  listen(canvas) {
-    let last = null;
-    canvas.onpointerdown = (event) => {
-      last = event;
-      canvas.setPointerCapture(event.pointerId);
-    };
-    canvas.onpointermove = (event) => {
-      if (!last) return;
-      for (const { scene } of this.stages) scene?.turn(event.clientX - last.clientX, event.clientY - last.clientY);
-      last = event;
-      this.draw();
-    };
-    canvas.onpointerup = canvas.onpointercancel = () => (last = null);
   }
 
   seek(t) {
@@ -94,7 +80,6 @@ class Replay {
       const { stage, scene } = this.stages[n];
       const now = sample(take, dt, this.time);
       stage.querySelector(".tilt").textContent = tiltOf(now.x[2], now.x[3]).toFixed(0) + "°";
-      if (!scene) return;
       scene.camera.target = [...now.x.slice(0, 2), 0.5];
       const driven = [...take.x.slice(0, now.n + 1), now.x];
       const paths = [{ points: take.x, color: take.color, dashed: true }, { points: driven, color: take.color, dashed: false }];
@@ -102,20 +87,15 @@ class Replay {
     });
   }
 
-  play() {
-    if ([this.end, this.episode.poster].includes(this.time)) this.time = 0;
-    this.playing = true;
-    this.find("play").textContent = "Pause";
-    everyFrame((seconds) => {
-      if (this.playing) this.seek(this.time + seconds * Number(this.find("speed").value));
-      if (this.time >= this.end) this.pause();
-      return this.playing;
-    });
+  setPlaying(playing) {
+    super.setPlaying(playing);
+    if (playing && [this.end, this.episode.poster].includes(this.time)) this.time = 0;
   }
 
-  pause() {
-    this.playing = false;
-    this.find("play").textContent = "Play";
+  tick(seconds) {
+    if (!this.playing) return;
+    this.seek(this.time + seconds);
+    if (this.time >= this.end) this.setPlaying(false);
   }
 }
 

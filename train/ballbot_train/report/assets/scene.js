@@ -105,11 +105,27 @@ function rgb(color) {
   return NIGHT.matches ? parts.map((part) => 0.35 + 0.65 * part) : parts;
 }
 
-/** Calls `step` in every frame with the seconds since the last one, at most 0.1, until it returns false. */
-function everyFrame(step, last = performance.now()) {
-  requestAnimationFrame((now) => {
-    if (step(Math.min(Math.max(now - last, 0) / 1000, 0.1)) !== false) everyFrame(step, now);
-  });
+/** What plays on a page, with its button and its choice of speeds. */
+class Player {
+  constructor(root) {
+    this.find = (name) => root.querySelector("." + name);
+    this.find("play").onclick = () => this.setPlaying(!this.playing);
+    this.wait(performance.now());
+  }
+
+  /** Calls `tick` in every frame, with the seconds to go on by, and those that have passed, at most 0.1. */
+  wait(last) {
+    requestAnimationFrame((now) => {
+      const passed = Math.min(Math.max(now - last, 0) / 1000, 0.1);
+      this.tick(this.playing ? passed * Number(this.find("speed").value) : 0, passed);
+      this.wait(now);
+    });
+  }
+
+  setPlaying(playing) {
+    this.playing = playing;
+    this.find("play").textContent = playing ? "Pause" : "Play";
+  }
 }
 
 /** A robot's points in state x, m, and its body's axes, the last one upwards. γ turns about y, then θ about the turned −x. */
@@ -122,12 +138,15 @@ function pose({ ball_radius, com_height, body_length }, x) {
 }
 
 class Scene {
-  /** Throws where the browser has no WebGL 2. `look` holds a robot's measures, colours and the scale of forces. */
+  /** Says so and throws where the browser has no WebGL 2. `look` holds a robot's measures, colours and the scale of forces. */
   constructor(canvas, look) {
     this.canvas = canvas;
     this.look = look;
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true }));
-    if (!gl) throw new Error("no WebGL 2");
+    if (!gl) {
+      canvas.replaceWith("The robots cannot be drawn: this browser has no WebGL 2.");
+      throw new Error("no WebGL 2");
+    }
     this.at = this.program();
     for (const name of ["sphere", "cylinder", "cone"]) this[name] = this.mesh(Mesh[name](), gl.STATIC_DRAW);
     this.strip = this.mesh([], gl.DYNAMIC_DRAW);
