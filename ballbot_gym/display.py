@@ -1,4 +1,5 @@
-"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table with a picture.
+"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table, of motions with a
+picture.
 
 Their 3D replays and figures are drawn by `ballbot_train.report`, which is imported when it is asked for.
 """
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Displayed:
-    """What shows itself by its facts and a picture."""
+    """What shows itself by its facts."""
 
     def facts(self) -> dict[str, str]:
         """What there is to say in a line: figures with their units, by what they are."""
@@ -28,9 +29,8 @@ class Displayed:
     def _table(self) -> dict[str, str]:
         return self.facts()
 
-    def plot(self) -> Any:
-        """A matplotlib Figure."""
-        raise NotImplementedError
+    def _picture(self) -> str:
+        return ""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{name} {value}' for name, value in self.facts().items())})"
@@ -42,11 +42,7 @@ class Displayed:
             for name, value in self._table().items()
         )
         table = "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
-        try:
-            picture = lazy.load("ballbot_train.report.notebook:as_image")(self.plot())
-        except ModuleNotFoundError:  # what draws is not installed
-            picture = ""
-        return f'<div style="display:flex;flex-wrap:wrap;align-items:center;gap:1em">{table}{picture}</div>'
+        return f'<div style="display:flex;flex-wrap:wrap;align-items:center;gap:1em">{table}{self._picture()}</div>'
 
 
 class Moving(Displayed):
@@ -59,6 +55,12 @@ class Moving(Displayed):
 
     def _table(self) -> dict[str, str]:
         return self.facts() | self.motion.facts()
+
+    def _picture(self) -> str:
+        try:
+            return lazy.load("ballbot_train.report.notebook:as_image")(self.plot())
+        except ModuleNotFoundError:  # what draws is not installed
+            return ""
 
     def show(self, *others: Moving, labels: Sequence[str] = (), robot: str | BallbotParams = "paper") -> Path | None:
         """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.

@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from ballbot_gym import files, lazy
+from ballbot_gym import files
 from ballbot_gym.display import Displayed, percent
 from ballbot_train.evaluation.statistics import interval
 
@@ -91,10 +91,6 @@ class Row(Displayed):
             "median settle time": f"{self.settle_time_median:.2f} s",
             "mean force": f"{self.effort_mean:.0f} N",
         }
-
-    def plot(self, *others: "Row") -> Any:
-        """A matplotlib Figure of the mean regret with its interval, beside that of other rows."""
-        return lazy.load("ballbot_train.report.notebook:plot_rows")((self, *others))
 
 
 def summarize(results: Sequence[Result], seed: int = 0) -> Row:

@@ -1,8 +1,6 @@
 """Replays as a strip of pictures or as a film."""
 
-import io
 import math
-import tempfile
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -44,32 +42,20 @@ def write_film(frames: Iterable[np.ndarray], path: Path, fps: int = 25) -> Path:
         fps: frames per second.
 
     Raises:
-        OSError: the file cannot be written, or there is no ffmpeg.
+        OSError: the file cannot be written.
+        RuntimeError: there is no ffmpeg.
     """
-    return files.write(path, _mp4(frames, fps, path) if path.suffix == ".mp4" else _webp(frames, fps))
-
-
-def _mp4(frames: Iterable[np.ndarray], fps: int, path: Path) -> bytes:
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # interrupted, ffmpeg may still write
-        unfinished = Path(folder) / path.name
-        options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-        try:
-            with imageio.get_writer(unfinished, **options) as writer:
-                for frame in frames:
-                    writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
-        except RuntimeError as error:  # imageio-ffmpeg raises it if its wheel brought no ffmpeg
-            raise OSError(f"{path}: cannot encode: {error}") from error
-        return unfinished.read_bytes()
-
-
-def _webp(frames: Iterable[np.ndarray], fps: int) -> bytes:
-    first, *others = map(Image.fromarray, frames)
-    frame_ms = round(1000 / fps)
-    durations = [frame_ms] * len(others) + [frame_ms + round(1000 * _PAUSE)]
-    options: dict[str, Any] = {"duration": durations, "loop": 0, "quality": 75, "method": 4}
-    buffer = io.BytesIO()
-    first.save(buffer, "WEBP", save_all=True, append_images=others, **options)
-    return buffer.getvalue()
+    if path.suffix == ".webp":
+        shown = list(frames)
+        durations = [round(1000 / fps)] * len(shown)
+        durations[-1] += round(1000 * _PAUSE)
+        options: dict[str, Any] = {"duration": durations, "loop": 0, "quality": 75, "method": 4}
+        return files.write(path, imageio.mimwrite("<bytes>", shown, "webp", **options))
+    options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    with imageio.get_writer("<bytes>", "mp4", **options) as writer:
+        for frame in frames:
+            writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+    return files.write(path, writer.request.get_result())  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def film_times(seconds: float, fps: int, speed: float) -> np.ndarray:

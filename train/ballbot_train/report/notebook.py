@@ -1,4 +1,4 @@
-"""`show` and `plot` of trajectories, episodes, optima and rows: 3D replays, below a notebook's cell too, and figures."""
+"""`show` and `plot` of trajectories, episodes and optima: 3D replays, below a notebook's cell too, and figures."""
 
 import base64
 import html
@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
@@ -22,9 +21,6 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Replay, Take, playable
-
-if TYPE_CHECKING:
-    from ballbot_train.evaluation.results import Row
 
 _HEIGHT = 520  # px of a replay below a cell
 
@@ -48,19 +44,6 @@ def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Bal
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
     """See `ballbot_gym.display.Moving.plot`."""
     return _figure(figures.trajectory_figure("", _takes(shown, names), _markers(shown)))
-
-
-def plot_rows(rows: "Sequence[Row]") -> Figure:
-    """See `ballbot_train.evaluation.results.Row.plot`."""
-    figure = Figure(figsize=(7, 1 + 0.4 * len(rows)), layout="constrained")
-    axis = figure.subplots()
-    for i, row in enumerate(rows):
-        middle, low, high = (100 * value for value in (row.regret_mean, row.regret_low, row.regret_high))
-        axis.errorbar(middle, i, xerr=[[middle - low], [high - middle]], fmt="o", color=labels.color(row.controller, i))
-    axis.set_yticks(range(len(rows)), [f"{row.controller}, {row.task}: {row.success:.0%} succeed" for row in rows])
-    axis.set(ylim=(len(rows) - 0.5, -0.5), xlabel="mean regret with its 95 % interval, %")
-    axis.grid(alpha=0.3)
-    return _figure(figure)
 
 
 def as_image(figure: Figure) -> str:
