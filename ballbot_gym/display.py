@@ -1,4 +1,4 @@
-"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table, of motions with a
+"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table; motions with a
 picture.
 
 Their 3D replays and figures are drawn by `ballbot_train.report`, which is imported when it is asked for.

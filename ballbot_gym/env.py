@@ -24,7 +24,7 @@ from ballbot_gym.drawing import Drawing, Robot
 from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import YAW, picture
+from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
@@ -33,7 +33,6 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_gym.viewer import Viewer, has_viser, import_viser
 
-_KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
 
@@ -325,15 +324,6 @@ class BallbotEnv(gymnasium.Env):
         self._page.show(drawing, self.task.control_dt)
         return None
 
-    def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:
-        """Keys for `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s, d push the ball as seen on the screen."""
-        ahead = np.array([math.sin(-YAW), math.cos(-YAW)])
-        aside = np.array([-ahead[1], ahead[0]])
-        ways = {"w": ahead, "a": aside, "s": -ahead, "d": -aside}
-        pairs = {(one, other): ways[one] + ways[other] for one in "ws" for other in "ad"}
-        ways_by_keys = {(key,): way for key, way in ways.items()} | pairs
-        return {keys: np.array(_KEY_FORCE * way, np.float32) for keys, way in ways_by_keys.items()}
-
     def get_state(self) -> EnvState:
         """The state of the env in its episode, from which `set_state` goes on bit-identically, for instance in tree search.
 
@@ -415,8 +405,6 @@ class BallbotEnv(gymnasium.Env):
         self._constants, self._constants_array = c, np.array(c, np.float64)
         if self._judge is not None:
             self._judge.set_constants(c)
-        if self._page is not None:
-            self._page.trace = []
 
     def _use_code(self, start: bool) -> None:
         """Takes machine code if there is some; if start, it is made in the background. `_set_constants` must follow."""

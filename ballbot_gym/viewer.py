@@ -12,7 +12,6 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -77,8 +76,6 @@ class Viewer:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.on_grab: Callable[[np.ndarray], object] | None = None
         """Gets how far (2,) on the floor somebody has dragged the robot, m, when the drag ends."""
-        self.trace: list[np.ndarray] = []
-        """Points (2,) at which `show` has shown the robot since they were emptied, m."""
         self._next = 0.0
         self._looks: object = None
         self._parts: list[list[Any]] = []
@@ -129,13 +126,11 @@ class Viewer:
             self._lines.points, self._lines.colors = _segments(drawing.lines)
 
     def show(self, drawing: Drawing, seconds: float) -> None:
-        """Shows a drawing of one robot, and its `trace`, when so much time has passed since the last one, s."""
+        """Shows a moment when so much time has passed since the last one, s."""
         now = time.perf_counter()
         self._next = max(self._next + seconds, now)
         time.sleep(self._next - now)
-        self.trace.append(drawing.robots[0].x[:2])
-        path = GroundPath(np.array(self.trace), drawing.robots[0].color)
-        self.draw(replace(drawing, paths=(path,) if len(self.trace) > 1 else ()))
+        self.draw(drawing)
 
     def close(self) -> None:
         """Stops the server; may be called again."""

@@ -336,24 +336,6 @@ def test_what_an_env_is_made_of_cannot_be_set(name, make_env):
     assert getattr(copy.deepcopy(env), name) == before
 
 
-def test_gymnasium_plays_it(monkeypatch):
-    pygame = pytest.importorskip("pygame")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    from gymnasium.utils.play import play
-
-    env = gymnasium.make("BallbotTurn-v0", render_mode="rgb_array", physics="rk4")
-    forces = []
-
-    def quit_after_three_steps(*step):
-        forces.append(step[-1]["force"])
-        pygame.event.post(pygame.event.Event(pygame.KEYDOWN if len(forces) == 1 else pygame.QUIT, key=ord("w")))
-
-    play(env, callback=quit_after_three_steps, noop=np.zeros(2, np.float32), seed=0, fps=1000)
-    np.testing.assert_array_equal(forces[0], [0, 0])
-    assert np.hypot(*forces[1]) == pytest.approx(0.2 * env.unwrapped.params.force_limit, rel=1e-6)
-    env.close()
-
-
 def test_render_before_reset_is_refused(make_env):
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"render\(\) before reset"):
         make_env(render_mode="rgb_array").render()

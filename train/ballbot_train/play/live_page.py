@@ -18,7 +18,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.console import markdown_text
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.simulation import PLANT, Playground, Start
+from ballbot_train.play.simulation import Playground, Start, severities
 from ballbot_train.report import labels
 
 PATIENCE = 0.1
@@ -115,11 +115,11 @@ class PlayPage:
         self._bind(self._controller, playground.set_controller, lambda: playground.main.name)
         self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
         with gui.add_folder("What the controllers do not know", expand_by_default=False):
-            for stress, (label, low, high, step) in PLANT.items():
-                slider = gui.add_slider(label, low, high, step, 0.0, hint=STRESSES[stress].label)
+            for stress, described in STRESSES.items():
+                slider = gui.add_slider(described.label, *severities(stress), initial_value=0.0)
                 self._bind(slider, partial(playground.set_plant, stress), partial(playground.plant.get, stress))
             told = gui.add_button("All as the controllers believe")
-            told.on_click(self._asking(lambda _: [playground.set_plant(stress, 0.0) for stress in PLANT]))
+            told.on_click(self._asking(lambda _: [playground.set_plant(stress, 0.0) for stress in STRESSES]))
         self._build_time()
         self._refresh()
 

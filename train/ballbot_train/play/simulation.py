@@ -42,16 +42,11 @@ _TRACE_STEPS = 400  # control steps that the trace on the floor goes back
 Start = int | Literal["rest", "random"]
 """The index of a certified episode, one that stands at the origin until it is pushed, or one with another start."""
 
-PLANT: dict[str, tuple[str, float, float, float]] = {
-    "mass": ("Masses, %", -50.0, 100.0, 5.0),
-    "com": ("Centre of mass, %", -30.0, 50.0, 5.0),
-    "delay": ("Delay, ms", 0.0, 120.0, 20.0),
-    "lag": ("Lag, ms", 0.0, 100.0, 5.0),
-    "noise": ("Sensor noise, ×", 0.0, 5.0, 0.25),
-    "push": ("Random pushes on the ball, N·s", 0.0, 12.0, 0.5),
-}
-"""What the controllers do not know: for a stress in `robustness.STRESSES` a label, the least and the greatest severity, and a
-step. 0 is nothing."""
+
+def severities(stress: str) -> tuple[float, float, float]:
+    """The least and the greatest severity of one of `STRESSES` to choose from, twice the table's, and a step; 0 is none."""
+    levels = STRESSES[stress].levels
+    return 2 * min(0.0, *levels), 2 * max(levels), min(map(abs, levels))
 
 
 class World:
@@ -208,7 +203,7 @@ class Playground:
         """Is told in words what is about to be done that may take long."""
         self.scores: list[Score] = []
         """Of the main robot's episodes."""
-        self.plant = dict.fromkeys(PLANT, 0.0)
+        self.plant = dict.fromkeys(STRESSES, 0.0)
         """Severity of each hidden change."""
         self.runners: list[Runner] = []
         """The main robot, then the ghosts."""
@@ -336,9 +331,9 @@ class Playground:
             self.runners.append(replace(self.main, **told, states=[self.main.x], forces=[]))
 
     def set_plant(self, stress: str, value: float) -> None:
-        """Changes what the controllers do not know, for every robot. The value is a severity within its bounds in `PLANT`."""
-        check_names("change", [stress], PLANT)
-        _, low, high, step = PLANT[stress]
+        """Changes what the controllers do not know, for every robot. The value is one of `severities`."""
+        check_names("change", [stress], STRESSES)
+        low, high, step = severities(stress)
         if not low <= value <= high:
             raise ValueError(f"{stress} must be {low:g} to {high:g}, not {value:g}")
         self.plant[stress] = step * round(value / step)

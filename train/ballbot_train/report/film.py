@@ -45,17 +45,21 @@ def write_film(frames: Iterable[np.ndarray], path: Path, fps: int = 25) -> Path:
         OSError: the file cannot be written.
         RuntimeError: there is no ffmpeg.
     """
+    options: dict[str, Any]
+    content: Any  # bytes
     if path.suffix == ".webp":
-        shown = list(frames)
+        shown: list[Any] = list(frames)
         durations = [round(1000 / fps)] * len(shown)
         durations[-1] += round(1000 * _PAUSE)
-        options: dict[str, Any] = {"duration": durations, "loop": 0, "quality": 75, "method": 4}
-        return files.write(path, imageio.mimwrite("<bytes>", shown, "webp", **options))
-    options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    with imageio.get_writer("<bytes>", "mp4", **options) as writer:
-        for frame in frames:
-            writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
-    return files.write(path, writer.request.get_result())  # pyright: ignore[reportAttributeAccessIssue]
+        options = {"duration": durations, "loop": 0, "quality": 75, "method": 4}
+        content = imageio.mimwrite("<bytes>", shown, "webp", **options)
+    else:
+        options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        with imageio.get_writer("<bytes>", "mp4", **options) as writer:
+            for frame in frames:
+                writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+        content = writer.request.get_result()
+    return files.write(path, content)
 
 
 def film_times(seconds: float, fps: int, speed: float) -> np.ndarray:
