@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym import dynamics, sensors
+from ballbot_gym import dynamics, sensors, step_code
 from ballbot_gym.checks import (
     check_constant_names,
     check_history,
@@ -28,12 +28,12 @@ from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
-from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.transition import limit_names, outcome
+from ballbot_gym.tasks.transition import Outcome, limit_names, outcome
 from ballbot_gym.viewer import Viewer, has_viser, import_viser
 
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
+_NOTHING_DONE = Outcome(0.0, -0.0, *(0.0,) * 5, violated=-1.0)  # whose reward_cost is 0.0
 _FLOAT32 = np.dtype(np.float32)
 
 
@@ -173,7 +173,7 @@ class BallbotEnv(gymnasium.Env):
         self._past = self._tried = np.zeros(0)  # the last observation with a history, and the action on it
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
-        self._judge: Judge | None = None  # in machine code
+        self._judge: step_code.Judge | None = None
         self._resets = 0
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
@@ -205,7 +205,7 @@ class BallbotEnv(gymnasium.Env):
         state, constants, *drawn = reset_options(options, "state", "constants", *draws)
         x, c = self._draw(state, constants)
         self._resets += 1
-        self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
+        self._use_code()
         judge, tilt = self._start(x, c)
         self._set_constants(c)
         self._state = x
@@ -222,7 +222,7 @@ class BallbotEnv(gymnasium.Env):
         self._steps_left, self._taken = self._steps, 0
         if self._human:
             self.render()
-        return self._shown(judge, tilt)
+        return self._shown(judge, (*_NOTHING_DONE, tilt), 0.0, (0.0,) * self.params.action_size)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -266,20 +266,17 @@ class BallbotEnv(gymnasium.Env):
             kept = -1.0 if lost else 0.0
         self._taken = steps = self._steps - self._steps_left
         judge = self._judge
-        judged = None if judge is None else judge.judge(before, force, x, steps, kept)
-        if judged is None:
-            did = outcome(self.task, before, force, x, self._constants, steps, (kept,))
-            judge, judged = None, (*did, dynamics.tilt(x))
-        cost, running, goal, terminated, truncated, success, _, violated, tilt = judged
-        if terminated > 0:
+        did = None if judge is None else judge.judge(before, force, x, steps, kept)
+        if did is None:
+            judge = None
+            did = *outcome(self.task, before, force, x, self._constants, steps, (kept,)), dynamics.tilt(x)
+        terminated = did[3] > 0
+        if terminated:
             self._steps_left = 0
         if self._human:
             self.render()
-        survive, running = self._survive, -running
-        seen, info = self._shown(
-            judge, tilt, cost, survive, running, goal, success > 0, int(violated), force, clipped, grip
-        )
-        return seen, survive + running + goal, terminated > 0, truncated > 0, info
+        seen, info = self._shown(judge, did, self._survive, force, clipped, grip)
+        return seen, self._survive - did[1] + did[2], terminated, did[4] > 0, info
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -383,7 +380,7 @@ class BallbotEnv(gymnasium.Env):
         if self._closed:
             self._simulator.close()
         elif self._state:
-            self._use_code(start=False)
+            self._use_code()
             self._set_constants(self._constants)
             self._restore_simulator(memory)
 
@@ -404,14 +401,16 @@ class BallbotEnv(gymnasium.Env):
         """Makes c the constants of the episode."""
         self._constants, self._constants_array = c, np.array(c, np.float64)
         if self._judge is not None:
-            self._judge.set_constants(c)
+            self._judge.c[:] = c
 
-    def _use_code(self, start: bool) -> None:
-        """Takes machine code if there is some; if start, it is made in the background. `_set_constants` must follow."""
+    def _use_code(self) -> None:
+        """Takes machine code if there is some, from the second episode on. `_set_constants` must follow."""
+        if self._resets < 2:
+            return  # an env of one episode is not worth a compilation
         if isinstance(self._simulator, Rk4Simulator):
-            self._simulator.use_code(start)
-        if self._judge is None and (code := Judge.made(self.task, self.params, start)) is not None:
-            self._judge = Judge(code, self.task, self.params)
+            self._simulator.use_code()
+        if self._judge is None:
+            self._judge = step_code.judge(self.task, self.params)
 
     def _restore_simulator(self, memory: tuple[float, ...] = ()) -> None:
         """Puts the simulator into the env's state, and what it remembers besides into its memory."""
@@ -430,21 +429,18 @@ class BallbotEnv(gymnasium.Env):
         needed = max(map(dynamics.needed_friction, asked))
         return (*asked[0], needed), not dynamics.keeps_grip(robot, asked)
 
-    def _start(self, x: State, c: State) -> tuple[Judge | None, float]:
+    def _start(self, x: State, c: State) -> tuple[step_code.Judge | None, float]:
         """Who judged a start, if machine code did, and its tilt, rad. Raises a ValueError if it is out of range."""
         if self._judge is not None:
-            self._judge.set_constants(c)
-            judged = self._judge.judge(x, (0.0,) * self.params.action_size, x, 0, 0.0)
-            if judged is not None and judged[7] < 0:
-                return self._judge, judged[8]
+            self._judge.c[:] = c
+            did = self._judge.judge(x, (0.0,) * self.params.action_size, x, 0, 0.0)
+            if did is not None and did[7] < 0:
+                return self._judge, did[8]
             if self._state:  # its episode goes on where this one cannot start
-                self._judge.set_constants(self._constants)
+                self._judge.c[:] = self._constants
         task = self.task
-        violated = [
-            name
-            for name, limit in zip(task.limit_names, task.limits(x, task.at(c, 0.0)), strict=True)
-            if not limit >= 0
-        ]
+        limits = zip(task.limit_names, task.limits(x, task.at(c, 0.0)), strict=True)
+        violated = [name for name, limit in limits if not limit >= 0]
         if violated:
             values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.OMNI_STATE, x, strict=False))
             raise ValueError(
@@ -495,19 +491,14 @@ class BallbotEnv(gymnasium.Env):
 
     def _shown(
         self,
-        judge: Judge | None,
-        tilt: float,
-        cost: float = 0.0,
-        survive: float = 0.0,
-        running: float = 0.0,
-        goal: float = 0.0,
-        success: bool = False,
-        violated: int = -1,
-        force: tuple[float, ...] | None = None,
+        judge: step_code.Judge | None,
+        did: State,
+        survive: float,
+        force: tuple[float, ...],
         clipped: bool = False,
         grip: tuple[float, ...] = _NO_GRIP,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Observation and `info` of a step that a judge judged last, or of one that Python judged; by default of a start."""
+        """Observation and `info` of what a step did, an `Outcome` and a tilt; who judged it, unless Python did."""
         seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
         if self._remembers:
             own, old = len(seen), self._past
@@ -517,20 +508,21 @@ class BallbotEnv(gymnasium.Env):
                 still = np.zeros(self.params.action_size, np.float32)
                 self._past = np.append(seen, np.tile(np.append(seen, still), self.history))
             seen = self._past.copy()
-        failure = violated >= 0
+        cost, running, goal, _, _, succeeded, failed, violated, tilt = did
+        success = succeeded > 0
         info = {
             "state": np.array(self._state) if judge is None else judge.x.copy(),
             "cost": cost,
             "reward_survive": survive,
-            "reward_cost": running,
+            "reward_cost": -running,
             "reward_goal": goal,
             "tilt": tilt,
             "success": success,
             "is_success": success,
-            "failure": failure,
-            "violated": violated,
-            "constraint_cost": 1.0 if failure else 0.0,
-            "force": np.array(force or (0.0,) * self.params.action_size) if judge is None else judge.force.copy(),
+            "failure": failed > 0,
+            "violated": int(violated),
+            "constraint_cost": failed,
+            "force": np.array(force) if judge is None else judge.force.copy(),
             "clipped": clipped,
             "constants": self._constants_array.copy(),
         }

@@ -1,7 +1,5 @@
 """Tasks whose cost, goal and observation depend on the episode's time: examples/figure_eight.py and examples/waypoints.py."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
@@ -12,11 +10,10 @@ from ballbot_baselines.batched import solves
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.trajopt import TrajoptController
-from ballbot_gym import BallbotEnv
+from ballbot_gym import BallbotEnv, step_code
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
-from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks.transition import outcome
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.learners.shac import ShacConfig
@@ -75,14 +72,11 @@ def test_a_step_costs_what_it_costs_at_its_beginning_and_is_judged_at_its_end(ta
 
 
 def test_machine_code_of_a_single_env_computes_the_bits_of_python(task, params):
-    deadline = time.monotonic() + 30
-    while (code := Judge.made(task, params, start=True)) is None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert code is not None
+    judge = step_code.judge(task, params)
+    assert judge is not None
     x, c = task.sample(np.random.default_rng(1), params)
     x, c, u, steps = tuple(x.tolist()), tuple(c.tolist()), (3.0, -2.0), 40
-    judge = Judge(code, task, params)
-    judge.set_constants(c)
+    judge.c[:] = c
     did = judge.judge(x, u, x, steps, 0.0)
     assert did is not None
     assert did[:-1] == outcome(task, x, u, x, c, steps, (0.0,))

@@ -1,7 +1,6 @@
 """Machine code of single environments: it changes speed, and nothing else."""
 
 import math
-import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 
 from ballbot_gym import TASKS, BallbotEnv, Randomization, dynamics, machine_code, ops, step_code, traced
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import Stabilize
 from ballbot_gym.tasks.transition import outcome
 
@@ -31,23 +29,11 @@ EVERYTHING = Randomization(
 def nothing_made(monkeypatch):
     """Forgets all machine code, and what is made in a test afterwards."""
     monkeypatch.setattr(step_code, "_codes", {})
-    monkeypatch.setattr(step_code, "_begun", set())
-    yield
-    wait()
 
 
-def wait() -> None:
-    """Until all machine code that was asked for is made."""
-    for thread in threading.enumerate():
-        if thread.name == "ballbot-code":
-            thread.join(60)
-
-
-def reset_until_made(env: BallbotEnv) -> None:
-    """Resets an env until it has machine code, if it can have some."""
+def begin_second_episode(env: BallbotEnv) -> None:
+    """From there on an env has machine code, if it can have some."""
     env.reset()
-    env.reset()
-    wait()
     env.reset()
 
 
@@ -90,8 +76,8 @@ def test_machine_code_gives_the_bits_of_python(task, physics, robot, randomizati
         patch.setattr(machine_code, "compiler", lambda: None)
         python = bits(play(env))
         assert env._judge is None
-    step_code._begun.clear()
-    reset_until_made(env)
+    step_code._codes.clear()
+    begin_second_episode(env)
     assert env._judge is not None
     assert physics == "bullet" or env._simulator._code is not None
     assert bits(play(env)) == python
@@ -102,7 +88,7 @@ def test_machine_code_gives_the_bits_of_python(task, physics, robot, randomizati
 def test_goals_limits_and_ends_are_those_of_python(task):
     """Random actions reach no goal, so states are put near it."""
     env: Any = BallbotEnv(task, "rk4")
-    reset_until_made(env)
+    begin_second_episode(env)
     assert env._judge is not None
     rng, ends = np.random.default_rng(0), set()
     for i in range(100):
@@ -110,7 +96,7 @@ def test_goals_limits_and_ends_are_those_of_python(task):
         reference = env.task.reference(x, c, env.params).x
         before, after = (tuple((reference[-1] + rng.normal(0, (0.05, 0.5)[i % 2], 8)).tolist()) for _ in range(2))
         c, force = tuple(c.tolist()), tuple(rng.uniform(-50, 50, 2).tolist())
-        env._judge.set_constants(c)
+        env._judge.c[:] = c
         steps, kept = env.task.steps - (i % 3 > 0), (0.0, -1.0)[i % 7 == 0]
         did = outcome(env.task, before, force, after, c, steps, (kept,))
         assert env._judge.judge(before, force, after, steps, kept) == (*did, dynamics.tilt(after))
@@ -122,12 +108,8 @@ def test_goals_limits_and_ends_are_those_of_python(task):
 @needs_compiler
 def test_numbers_that_are_not_finite_are_left_to_python(params):
     simulator: Any = Rk4Simulator(params, 0.02)
-    simulator.use_code(start=True)
-    Judge.made(Stabilize(), params, start=True)
-    wait()
-    simulator.use_code(start=False)
-    code: Any = Judge.made(Stabilize(), params, start=False)
-    judge = Judge(code, Stabilize(), params)
+    simulator.use_code()
+    judge: Any = step_code.judge(Stabilize(), params)
     good, bad = (0.1,) * 8, (0.1,) * 4 + (math.inf,) + (0.1,) * 3
     for x, finite in ((good, True), (bad, False)):
         simulator.reset(x)
@@ -147,7 +129,7 @@ class Branching(Stabilize):
 
 def test_tasks_that_machine_code_does_not_know_stay_in_python():
     env = BallbotEnv(Branching(), "rk4")
-    reset_until_made(env)
+    begin_second_episode(env)
     assert env._judge is None
     assert env.step([0.1, 0.1])[-1]["cost"] >= 0
 
@@ -176,7 +158,7 @@ def test_whatever_ops_computes_is_computed_alike_in_machine_code():
 @needs_compiler
 def test_an_episode_goes_on_after_a_reset_that_is_refused():
     env, other = BallbotEnv("orbit", "rk4"), BallbotEnv("orbit", "rk4")
-    reset_until_made(env)
+    begin_second_episode(env)
     start = env.reset(seed=0)[1]
     other.reset(seed=0)
     with pytest.raises(ValueError, match="out of range"):
@@ -187,4 +169,4 @@ def test_an_episode_goes_on_after_a_reset_that_is_refused():
 def test_an_env_of_one_episode_makes_no_machine_code():
     env = BallbotEnv("stabilize", "rk4")
     env.reset()
-    assert step_code._begun == set()
+    assert not step_code._codes

@@ -26,14 +26,12 @@ class Rk4Simulator(Simulator):
         check_kind(params, self._params)
         self._params = params
         if self._code is not None:
-            self._code.numbers[-len(step_code.ROBOT) :] = [getattr(params, name) for name in step_code.ROBOT]
+            self._code.given[-len(step_code.ROBOT) :] = [getattr(params, name) for name in step_code.ROBOT]
 
-    def use_code(self, start: bool) -> None:
-        """Takes machine code if there is some; if start, it is made in the background."""
-        if self._code is None and (code := step_code.motion(self._params, start)) is not None:
-            states, held = self._params.state_size, self._params.state_size + self._params.action_size
-            self._code = step_code.Work(code, held, states, in_place=True)
-            self._code.numbers[1 + held] = self._dt / self._substeps
+    def use_code(self) -> None:
+        """Takes machine code if there is some."""
+        if self._code is None:
+            self._code = step_code.motion(self._params, self._dt / self._substeps)
             self.set_params(self._params)
 
     def step(self, u: tuple[float, ...]) -> State:
