@@ -27,7 +27,6 @@ _EYE, _AIM = (-2.6, -1.8, 1.5), (0.0, 0.0, 0.5)  # m: from behind a robot that m
 _SQUARE = 1.0  # m, of the floor
 _LINE_HEIGHT = 0.008  # m, so that lines on the floor do not flicker
 _SHADOW, _SHADOW_HEIGHT = 0.3, 0.003  # opacity, and m above the floor
-_MOST_SEGMENTS = 120  # of a path
 _DASH = 2  # a dashed line shows every second segment
 _FOLLOW = 0.15  # share of the distance by which the camera follows in each drawing
 _JUMP = 4.0  # m, of a distance that it follows at once
@@ -234,13 +233,10 @@ def _opacity(alpha: float) -> float | None:
 
 
 def _segments(paths: Sequence[GroundPath]) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2, 3) the line segments of paths, at most `_MOST_SEGMENTS` each, m, and the colours of their ends."""
+    """(n, 2, 3) the line segments of paths, m, and the colours of their ends."""
     segments, colors = [np.zeros((0, 2, 3), np.float32)], [np.zeros((0, 2, 3), np.uint8)]
     for path in paths:
-        points = path.points
-        if len(points) > _MOST_SEGMENTS:
-            points = points[np.linspace(0, len(points) - 1, _MOST_SEGMENTS + 1).round().astype(int)]
-        on_floor = np.column_stack([points, np.full(len(points), _LINE_HEIGHT)])
+        on_floor = np.column_stack([path.points, np.full(len(path.points), _LINE_HEIGHT)])
         segments.append(np.stack([on_floor[:-1], on_floor[1:]], axis=1)[:: _DASH if path.dashed else 1])
         colors.append(np.full(segments[-1].shape, rgb(path.color)))
     return np.concatenate(segments, dtype=np.float32), np.concatenate(colors, dtype=np.uint8, casting="unsafe")

@@ -96,8 +96,8 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
         each.push(3.0, -2.0)
         go(each, 0.5)
     assert playground.runners[1].x == alone.main.x != playground.main.x
-    playground.set_ghosts(["trajopt"])  # which begins where the robot is
-    assert playground.runners[1].x == playground.main.x
+    playground.set_ghosts(["trajopt"])  # all begin again
+    assert playground.runners[1].x == playground.main.x == tuple(playground.start[0])
 
 
 def test_controllers_change_without_a_jump(play):

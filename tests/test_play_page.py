@@ -34,7 +34,7 @@ class Opened:
         self.thread.start()
 
     def close(self):
-        self.page.stop()
+        self.page.stopped = True
         self.thread.join(10)
         assert not self.thread.is_alive()
         self.viewer.close()

@@ -45,7 +45,7 @@ def test_the_page_shows_robots_arrows_paths_and_markers_where_they_are(viewer, p
     assert end - start == pytest.approx([0.5, 0, 0])
     assert shown["/world/bodies/robot1/label"].text == "LQR fell"
     assert (len(shown[f"/world/{PUSH}"].points), "/world/bodies/post0" in shown) == (1, True)
-    viewer.draw(Drawing(params, (Robot(STATE),), (GroundPath(np.zeros((300, 2)), "#e08a00"),)))
+    viewer.draw(Drawing(params, (Robot(STATE),), (GroundPath(np.zeros((121, 2)), "#e08a00"),)))
     assert "/world/bodies/robot1/ball" not in nodes(viewer)
     assert [len(nodes(viewer)[f"/world/{name}"].points) for name in ("lines", FORCE)] == [120, 0]
     viewer.draw(Drawing(params, ()))

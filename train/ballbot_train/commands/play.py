@@ -47,7 +47,7 @@ def play(
     playground = Playground(task, controller, ghosts, physics, episode, seed, robot, randomization)
     viewer = Viewer(port, "ballbot play")
     page = PlayPage(playground, viewer)
-    signal.signal(signal.SIGTERM, lambda *_: page.stop())
+    signal.signal(signal.SIGTERM, lambda *_: setattr(page, "stopped", True))
     try:
         console.print(f"open {viewer.address}\nCtrl+C ends it", highlight=False)
         page.run()

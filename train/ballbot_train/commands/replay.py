@@ -7,7 +7,7 @@ from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
-from ballbot_train.report.replay import Replay, certified_replay, file_replay
+from ballbot_train.report.replay import certified_replay, file_replay
 
 _MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "webp": 640}  # px
@@ -53,7 +53,19 @@ def replay(
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
     physics = physics_or_default(physics)
-    shown, name = _read(source, controllers, episode, physics, robot, frictions)
+    if all(Path(entry).suffix == ".npz" for entry in source):
+        _check(bool(source), "give the name of a task, or trajectory files")
+        _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
+        paths = [Path(entry) for entry in source]
+        shown, name = file_replay(paths), "-".join(path.stem for path in paths)
+    else:
+        _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
+        check_names("task", source, TASKS)
+        _check(bool(controllers), "give at least one controller")
+        shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)
+        made = file_name(source[0], robot)
+        name = f"{made}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
+        name += "-on-" * bool(frictions) + "-".join(f"{friction:g}" for friction in frictions)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
@@ -66,32 +78,6 @@ def replay(
         drawn = film_frames(shown, times, width or _WIDTHS[format])
         write_film(progress.track(drawn, total=len(times), description="frames"), path, fps)
     console.print(f"film: {path}, {path.stat().st_size / 1e6:.1f} MB")
-
-
-def _read(
-    source: tuple[str, ...],
-    controllers: tuple[str, ...],
-    episode: int,
-    physics: str,
-    robot: str,
-    frictions: tuple[float, ...],
-) -> tuple[Replay, str]:
-    """The replay to draw, and the name of its file."""
-    if all(Path(entry).suffix == ".npz" for entry in source):
-        _check(bool(source), "give the name of a task, or trajectory files")
-        _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
-        paths = [Path(entry) for entry in source]
-        return file_replay(paths), "-".join(path.stem for path in paths)
-    _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
-    task = source[0]
-    check_names("task", [task], TASKS)
-    _check(bool(controllers), "give at least one controller")
-    shown = certified_replay(task, controllers, episode, physics, robot=robot, frictions=frictions)
-    made = file_name(task, robot)
-    name = f"{made}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
-    if frictions:
-        name = f"{name}-on-{'-'.join(f'{friction:g}' for friction in frictions)}"
-    return shown, name
 
 
 def _check(right: bool, message: str) -> None:

@@ -41,9 +41,8 @@ class PlayPage:
             viewer: where it is shown. The page closes neither of them.
         """
         self.playground, self.viewer, self._gui = playground, viewer, viewer.server.gui
-        self.paused = False
+        self.paused = self.stopped = False
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        self._stopped = False
         self._next_text = 0.0
         self._bound: list[tuple[Any, Callable[[], Any]]] = []
         self._ghosts: dict[str, Any] = {}
@@ -54,10 +53,10 @@ class PlayPage:
     # --- the loop ---
 
     def run(self, seconds: float = math.inf) -> None:
-        """Simulates and draws in real time until `stop` is called, or for some seconds. Stands still while nobody watches."""
+        """Simulates and draws in real time until `stopped` is set, or for some seconds. Stands still while nobody watches."""
         now = due = next_draw = time.perf_counter()
         end = now + seconds
-        while not self._stopped and now < end:
+        while not self.stopped and now < end:
             self._do_requests()
             if not self.watched:
                 time.sleep(_IDLE)
@@ -85,10 +84,6 @@ class PlayPage:
     def next_due(self, now: float, due: float) -> float:
         """When the step is due, s, that follows one that was due at `due` and begins now."""
         return max(due, now - PATIENCE) + self.playground.world.task.control_dt / max(_SLOWEST, self.speed.value)
-
-    def stop(self) -> None:
-        """Ends `run`; from any thread."""
-        self._stopped = True
 
     def _do_requests(self) -> None:
         """Does what was asked for until now. What cannot be done is said, and the simulation goes on."""
@@ -180,7 +175,7 @@ class PlayPage:
 
     def _set_ghost(self, name: str, wanted: bool) -> None:
         others = [ghost for ghost in self.playground.ghosts if ghost != name]
-        self.playground.set_ghosts([*others, name] if wanted else others)
+        self.playground.set_ghosts([*others, *[name] * wanted])
 
     def _toggle(self) -> None:
         self.paused = not self.paused

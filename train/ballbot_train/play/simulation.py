@@ -4,7 +4,6 @@ The robot that counts is the main one. Ghosts get the same start and the same pu
 """
 
 import contextlib
-import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -37,7 +36,7 @@ _FIRST_PUSH_AFTER = 1.0  # s
 
 _PAUSE = 1.5  # s, between the end of a robot and its next episode
 _PUSH_SHOWN = 0.3  # s, for which a push is drawn
-_TRACE_STEPS = 400  # control steps that the trace on the floor goes back
+_TRACE_STEPS, _TRACE_EVERY = 400, 4  # control steps that the trace on the floor goes back, and between its points
 
 Start = int | Literal["rest", "random"]
 """The index of a certified episode, one that stands at the origin until it is pushed, or one with another start."""
@@ -214,7 +213,8 @@ class Playground:
         self._track = checked_randomization(randomization)
         self._physics = default_physics() if physics is None else physics
         world = World(task, robot)
-        self._open(world, [world.best if controller is None else controller, *ghosts], episode)
+        self._open(world, [world.best if controller is None else controller, *ghosts])
+        self.begin("random" if world.certified is None and episode != "rest" else episode)
 
     # --- what it is ---
 
@@ -260,7 +260,7 @@ class Playground:
             said = _failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
             label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
             robots.append(Robot(np.array(runner.x), colors[i], force, alpha, push, label))
-            trace = np.array(runner.states[-_TRACE_STEPS:])[:, :2]
+            trace = np.array(runner.states[:-_TRACE_STEPS:-_TRACE_EVERY])[:, :2]
             paths += [GroundPath(trace, colors[i])] * (len(trace) > 1)
         return Drawing(self.world.params, tuple(robots), tuple(paths), tuple(self.world.task.markers(self.start[1])))
 
@@ -308,27 +308,22 @@ class Playground:
         """Another task, or another robot, under the same controllers where they are made for it."""
         world = World(task or self.world.task_name, robot or self.world.robot)
         main = self.main.name if self.main.name in world.controllers else world.best
-        self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)], 0)
+        self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)])
+        self.begin("random" if world.certified is None else 0)
 
     def set_controller(self, name: str) -> None:
         """Another controller for the main robot, which goes on where it is."""
-        controller = self._ready(name)
-        self.set_ghosts([ghost for ghost in self.ghosts if ghost != name])
+        controller = self._made(name, self.world)
+        if not self.ended:
+            controller.reset(self.seconds, np.array(self.main.x), self.start[1])
         self.main.name, self.main.controller = name, controller
         if self.ended:
             self.restart()
 
     def set_ghosts(self, ghosts: Sequence[str]) -> None:
-        """Other ghosts. A new one begins where the main robot is."""
-        wanted = [name for name in dict.fromkeys(ghosts) if name != self.main.name]
-        ready = {name: self._ready(name) for name in wanted if name not in self.ghosts}
-        for runner in self.runners[1:]:
-            if runner.name not in wanted:
-                runner.env.close()
-                self.runners.remove(runner)
-        for name, controller in ready.items():
-            told = {"name": name, "controller": controller, "env": copy.deepcopy(self.main.env)}
-            self.runners.append(replace(self.main, **told, states=[self.main.x], forces=[]))
+        """Other ghosts. The episode begins again, because all have the same start."""
+        self._open(self.world, [self.main.name, *ghosts])
+        self.restart()
 
     def set_plant(self, stress: str, value: float) -> None:
         """Changes what the controllers do not know, for every robot. The value is one of `severities`."""
@@ -363,12 +358,11 @@ class Playground:
 
     # --- inside ---
 
-    def _open(self, world: World, controllers: Iterable[str], episode: Start) -> None:
-        made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
+    def _open(self, world: World, controllers: Iterable[str]) -> None:
+        made = [(name, self._made(name, world)) for name in controllers]
         self.close()
         self.world = world
-        self.runners = [Runner(*each, self._env(world)) for each in made.items()]
-        self.begin("random" if world.certified is None and episode != "rest" else episode)
+        self.runners = [Runner(*each, self._env(world)) for each in made]
 
     def _made(self, name: str, world: World) -> Controller:
         """A controller by name, which is offered from then on."""
@@ -376,13 +370,6 @@ class Playground:
         controller = make_controller(name, world.task, world.params)
         if name not in world.controllers:  # a file
             world.controllers.append(name)
-        return controller
-
-    def _ready(self, name: str) -> Controller:
-        """A controller that goes on from where the main robot is."""
-        controller = self._made(name, self.world)
-        if not self.ended:
-            controller.reset(self.seconds, np.array(self.main.x), self.start[1])
         return controller
 
     def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: Start) -> None:

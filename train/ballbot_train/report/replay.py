@@ -12,7 +12,7 @@ from ballbot_gym.drawing import Drawing, GroundPath, Robot
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.robots import PAPER, named_robot
-from ballbot_gym.rollout import Controller, PlanError, rollout
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation import optima
@@ -112,44 +112,33 @@ def certified_replay(
     episode_set = optima.known(problem, robot, [episode])
     takes = []
     for name, friction in itertools.product(controllers, frictions or (None,)):
+        controller, slips = make_controller(name, problem, params), list[float]()
         env = BallbotEnv(problem, physics=physics, robot=floor(robot, friction))
         try:
-            take = _take(env, make_controller(name, problem, params), name, len(takes), episode_set, episode)
+            options = episode_set.options(episode)
+            run = rollout(
+                env, controller, options=options, watch=lambda _, env=env, slips=slips: slips.append(env.slip)
+            )
         except PlanError:
             if not skip_planless:
                 raise
             continue
         finally:
             env.close()
+        label, color, slip = labels.label(name), labels.color(Path(name).stem, len(takes)), np.array(slips)
+        note = f"fails at {run.trajectory.duration:.2f} s"
+        if not run.failure:
+            regret = round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0  # no −0.0
+            of = "" if friction in (None, params.friction) else f" to the optimum of friction {params.friction:g}"
+            note = f"regret {regret:.1f} %{of}"
+        if slip.max() > LEAST_SLIP:
+            note += f"; slips for {problem.control_dt * np.count_nonzero(slip > LEAST_SLIP):.2f} s"
         if friction is not None:  # the floor gives the colour, because one controller runs on several
-            label = f"friction {friction:g}" if len(controllers) == 1 else f"{take.label}, friction {friction:g}"
-            note = take.note
-            if friction != params.friction:
-                note = note.replace(" %", f" % to the optimum of friction {params.friction:g}", 1)
-            take = replace(take, label=label, note=note, color=labels.color("", len(takes)))
-        takes.append(take)
+            label = f"{label}, friction {friction:g}" if len(controllers) > 1 else f"friction {friction:g}"
+            color = labels.color("", len(takes))
+        takes.append(Take(label, run.trajectory, color, note, run.failure, slip=slip))
     markers = tuple(problem.markers(episode_set.constants[episode]))
     return Replay(f"{task}, certified episode {episode}", tuple(takes), markers, params)
-
-
-def _take(
-    env: BallbotEnv,
-    controller: Controller,
-    name: str,
-    i: int,
-    episode_set: certified.EvaluationSet,
-    episode: int,
-) -> Take:
-    slips: list[float] = []
-    run = rollout(env, controller, options=episode_set.options(episode), watch=lambda _: slips.append(env.slip))
-    if run.failure:
-        note = f"fails at {run.trajectory.duration:.2f} s"
-    else:
-        note = f"regret {round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0:.1f} %"  # + 0: no −0.0
-    slip = np.array(slips)
-    if slip.max() > LEAST_SLIP:
-        note = f"{note}; slips for {env.task.control_dt * np.count_nonzero(slip > LEAST_SLIP):.2f} s"
-    return Take(labels.label(name), run.trajectory, labels.color(Path(name).stem, i), note, run.failure, slip=slip)
 
 
 def telling_episode(task: str, results: Sequence[Result]) -> int:
