@@ -1,5 +1,6 @@
 """What vector envs do where episodes end: a step of a `BallbotBatch` in each of Gymnasium's modes, and what infos say."""
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,33 +15,8 @@ _NOTHING_DONE = ("reward", "cost", "terminated", "truncated", "success", "failur
 """Fields of a `BatchStep` that are 0 of an env that waits."""
 
 
-class StepInfo(NamedTuple):
-    """What an info says of B environments, in NumPy arrays: of the step, or of the start of an episode."""
-
-    x: np.ndarray
-    """(8, B) states."""
-    cost: np.ndarray
-    """(B,) float64, of the step."""
-    reward_parts: np.ndarray
-    """(3, B) float64, `env.REWARD_PARTS`; their sum is the reward."""
-    tilt: np.ndarray
-    """(B,) rad."""
-    force: np.ndarray
-    """(2, B) N."""
-    success: np.ndarray
-    """(B,) bool."""
-    failure: np.ndarray
-    """(B,) bool."""
-    violated: np.ndarray
-    """(B,) int64, as of `BatchStep`, where `failure` holds."""
-    clipped: np.ndarray
-    """(B,) bool."""
-    c: np.ndarray
-    """(nc, B) constants."""
-    grip: np.ndarray
-    """(4, B), as of `BatchStep`; (0, B) where friction is unlimited."""
-    drawn: np.ndarray
-    """(6 or 14, B), as of `BatchState`; (0, B) where nothing is drawn."""
+Info = dict[str, np.ndarray]
+"""What an info says of B environments, with the keys of `BallbotEnv`'s: of a step, or of the start of an episode."""
 
 
 class VectorStep(NamedTuple):
@@ -58,9 +34,9 @@ class VectorStep(NamedTuple):
     """(n,) indices of the envs whose episode ended."""
     final_observation: np.ndarray
     """(n, no) float32, what these saw at its end."""
-    now: StepInfo
+    now: Info
     """Of the envs now."""
-    end: StepInfo
+    end: Info
     """Of the step even where its end began a new episode; else as `now`."""
 
 
@@ -95,13 +71,11 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
         parts[1, failed] = reward[failed] - survive  # the cost has a failure's price too
         if batch.task.first_exit:
             parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * result.success[ended]
-    x, c, drawn = started(batch.state)
-    flags = result.success, result.violated >= 0, result.violated, result.clipped
-    end = now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip, drawn)
+    state, did = batch.state, (result.force, result.success, result.violated >= 0, result.clipped, result.grip)
+    end = now = info_of(state, result.tilt, result.violated, cost, parts, *did)
     if batch.restarts and ended.size:
-        _, c, drawn = started(before)
-        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=c, drawn=drawn)
-        now = _begun(now, ended)
+        end = info_of(before._replace(x=result.final_x), result.final_tilt, result.violated, cost, parts, *did)
+        now = info_of(state, result.tilt, result.violated, *(_without(part, ended) for part in (cost, parts, *did)))
     seen, last = (part.astype(np.float32, copy=False) for part in (result.observation, result.final_observation))
     return VectorStep(seen, reward, result.terminated, result.truncated, ended, last[ended], now, end)
 
@@ -121,20 +95,69 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
     )
 
 
-def started(state: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States, constants and draws of a `BatchState`, whatever its arrays are."""
-    return as_array(state.x), as_array(state.c), as_array(state.drawn)
+def info_of(
+    state: Any,
+    tilt: np.ndarray,
+    violated: np.ndarray,
+    cost: np.ndarray,
+    reward_parts: np.ndarray,
+    force: np.ndarray,
+    success: np.ndarray,
+    failure: np.ndarray,
+    clipped: np.ndarray,
+    grip: np.ndarray,
+) -> Info:
+    """An info. Arrays that share memory with the arguments' state are read-only.
+
+    Args:
+        state: a `BatchState` with what is told of states, constants and draws, whatever its arrays are.
+        tilt: (B,) rad.
+        violated: (B,) int64, as of `BatchStep`, where `failure` holds.
+        cost: (B,) float64, of the step.
+        reward_parts: (3, B) float64, which add up to the reward.
+        force: (2, B) N.
+        success, failure, clipped: (B,) bool.
+        grip: (4, B), as of `BatchStep`; (0, B) where friction is unlimited.
+    """
+    x, c, drawn = as_array(state.x).T, as_array(state.c).T, as_array(state.drawn)
+    size = len(cost)
+    failed = np.count_nonzero(failure)
+    violated = violated if failed else filled(-1, size)
+    x.flags.writeable = c.flags.writeable = violated.flags.writeable = False
+    info = {
+        "state": x,
+        "cost": cost,
+        "reward_survive": reward_parts[0],
+        "reward_cost": reward_parts[1],
+        "reward_goal": reward_parts[2],
+        "tilt": tilt,
+        "success": success,
+        "is_success": success,
+        "failure": failure,
+        "violated": violated,
+        "constraint_cost": failure.astype(np.float64) if failed else filled(0.0, size),
+        "force": force.T,
+        "clipped": clipped,
+        "constants": c,
+    }
+    if len(grip):
+        info["grip"] = grip.T
+    if len(drawn):
+        info["drawn"] = drawn.T.copy()
+    return info
+
+
+@lru_cache(maxsize=16)
+def filled(value: Any, size: int) -> np.ndarray:
+    """A read-only array (size,) of one value."""
+    array = np.full(size, value)
+    array.flags.writeable = False
+    return array
 
 
 def as_array(part: Any) -> np.ndarray:
     """A tensor, or an array, as an array."""
     return part if isinstance(part, np.ndarray) else part.cpu().numpy()
-
-
-def _begun(now: StepInfo, which: np.ndarray) -> StepInfo:
-    """What infos say where episodes have begun in place of ended ones, as after `reset`."""
-    cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
-    return now._replace(**{name: _without(getattr(now, name), which) for name in cleared})
 
 
 def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:

@@ -533,10 +533,6 @@ class BallbotEnv(gymnasium.Env):
         return seen, info
 
 
-REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
-"""Keys of `info` whose values add up to the reward."""
-
-
 def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fields: Any) -> Task:
     """The task named, with some fields replaced.
 

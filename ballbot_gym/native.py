@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.autoreset import StepInfo, VectorStep, step
+from ballbot_gym.autoreset import Info, VectorStep, info_of, step
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.params import BallbotParams
@@ -172,9 +172,10 @@ class BallbotNative:
         self._state = old._replace(x=told[: self.params.state_size], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
         ended = flags[5].nonzero()[0]
-        now = end = self._info(told, pay[1:5], flags[2:5], violated, c)
-        if restarts:
-            end = self._info(told[self._told_rows :], pay[5:], flags[6:], violated, old.c)
+        now = end = self._info(self._state, told, pay[1:5], flags[2:5], violated)
+        if restarts and ended.size:
+            told = told[self._told_rows :]
+            end = self._info(old._replace(x=told[: self.params.state_size]), told, pay[5:], flags[6:], violated)
         last = (last if restarts else observation).take(ended, 0)
         return VectorStep(observation, pay[0], flags[0], flags[1], ended, last, now, end)
 
@@ -192,15 +193,13 @@ class BallbotNative:
             ((size * kept, self._seen_rows), single),
         ]
 
-    def _info(
-        self, told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray, c: np.ndarray
-    ) -> StepInfo:
-        """Rows that native.c has written, as an info names them."""
+    def _info(self, state: State, told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray) -> Info:
+        """An info of a state and of rows that native.c has written."""
         tilt = self.params.state_size
         grip = tilt + 1 + self.params.action_size
-        force = told[tilt + 1 : grip]
-        marks, drawn = (flags[0], flags[1], violated, flags[2]), self._state.drawn
-        return StepInfo(told[:tilt], pay[0], pay[1:], told[tilt], force, *marks, c, told[grip : self._told_rows], drawn)
+        force, (success, failure, clipped) = told[tilt + 1 : grip], flags[:3]
+        did = pay[0], pay[1:], force, success, failure, clipped, told[grip : self._told_rows]
+        return info_of(state, told[tilt], violated, *did)
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
@@ -281,7 +280,7 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDL
     found = {"first observation": own.observe(first), "start": first.x, "constants": first.c}
     expected = {"first observation": batch.observe(start), "start": start.x, "constants": start.c}
     for values, done in ((found, own.step(actions)), (expected, step(batch, actions, None))):
-        values |= done._asdict() | done.now._asdict() | {f"final {k}": part for k, part in done.end._asdict().items()}
+        values |= done._asdict() | done.now | {f"final {k}": part for k, part in done.end.items()}
     for name in expected.keys() - {"now", "end"}:
         if not np.allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")

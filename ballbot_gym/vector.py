@@ -21,7 +21,7 @@ from ballbot_gym.checks import (
 )
 from ballbot_gym.drawing import Drawing, Robot
 from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
-from ballbot_gym.env import REWARD_PARTS, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import picture
@@ -40,30 +40,11 @@ except ImportError as error:
         'vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.autoreset import StepInfo, as_array, started, step
+from ballbot_gym.autoreset import Info, as_array, filled, info_of, step
 from ballbot_gym.batch import BallbotBatch, BatchState, dtype_named, tilt_of
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
-
-_INFO_KEYS = tuple(
-    (name, f"_{name}")
-    for name in (
-        "state",
-        "cost",
-        *REWARD_PARTS,
-        "tilt",
-        "success",
-        "is_success",
-        "failure",
-        "violated",
-        "constraint_cost",
-        "force",
-        "clipped",
-        "constants",
-    )
-)
-"""Keys of an info, each with that of its mask."""
 
 _ENGINES = ("auto", "native", "torch")
 
@@ -177,10 +158,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.batch.most_steps = _most_steps(max_episode_steps, self.task)
         self.batch.restarts = self.autoreset_mode is AutoresetMode.SAME_STEP
-        self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
-        self._everywhere = np.ones(self.num_envs, np.bool_)
-        for array in (self._none, self._nothing, self._everywhere):
-            array.flags.writeable = False
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -229,14 +206,14 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             observation = self.batch.observe(state)
             tilt: Any = tilt_of(state.x.unbind(0)) if isinstance(self.batch, BallbotBatch) else self.batch.tilt(state)
         self._ended = self._ended & ~mask
-        size, (x_now, c_now, drawn) = self.num_envs, started(state)
-        tilt = as_array(tilt).astype(self._dtype, copy=False)
-        force, grip = (np.zeros((rows, size), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips))
-        success, failure, clipped = np.zeros((3, size), bool)
-        parts = np.zeros((4, size))
-        flags = success, failure, self._none, clipped
-        infos = self._info(StepInfo(x_now, parts[0], parts[1:], tilt, force, *flags, c_now, grip, drawn), mask)
-        return as_array(observation).astype(np.float32, copy=False), infos
+        force, grip = (
+            np.zeros((rows, self.num_envs), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips)
+        )
+        cost, parts = np.zeros(self.num_envs), np.zeros((3, self.num_envs))
+        success, failure, clipped = np.zeros((3, self.num_envs), bool)
+        none = filled(-1, self.num_envs)
+        info = info_of(state, as_array(tilt), none, cost, parts, force, success, failure, clipped, grip)
+        return as_array(observation).astype(np.float32, copy=False), _masked(info, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -269,12 +246,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if not batch.restarts:
             self._ended = done
         elif result.ended.size:
-            infos["final_info"] = self._info(result.end, done)
+            infos["final_info"] = _masked(result.end, done)
             infos["final_obs"] = np.full(result.observation.shape, np.nan, np.float32)
             infos["final_obs"][result.ended] = result.final_observation
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-        infos |= self._info(result.now, self._everywhere)
+        infos |= _masked(result.now, filled(True, self.num_envs))
         return result.observation, result.reward, result.terminated, result.truncated, infos
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -353,29 +330,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """The array as the batch takes it."""
         return torch.from_numpy(array).to(self.batch.device) if isinstance(self.batch, BallbotBatch) else array
 
-    def _info(self, told: StepInfo, mask: np.ndarray) -> dict[str, Any]:
-        """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
-
-        Arrays that share the batch's memory are read-only.
-        """
-        x, c, success, failure, violated = told.x.T, told.c.T, told.success, told.failure, self._none
-        constraint_cost = self._nothing
-        if np.count_nonzero(failure):
-            violated, constraint_cost = told.violated.view(), failure.astype(np.float64)
-        x.flags.writeable = c.flags.writeable = violated.flags.writeable = False
-        values = (
-            x, told.cost, *told.reward_parts, told.tilt, success, success, failure, violated, constraint_cost,
-            told.force.T, told.clipped, c,
-        )  # fmt: skip
-        infos = {}
-        for (name, mask_name), value in zip(_INFO_KEYS, values, strict=True):
-            infos[name], infos[mask_name] = value, mask
-        if self.params.grips:
-            infos["grip"], infos["_grip"] = told.grip.T, mask
-        if self.randomization.varies_episodes:
-            infos["drawn"], infos["_drawn"] = told.drawn.T.copy(), mask
-        return infos
-
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
         """(nc, B) constants: those given, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
@@ -400,6 +354,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             bad = np.flatnonzero(mask & ~safe)
             raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")
         return state._replace(x=self._to_batch(x))
+
+
+def _masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
+    """An info with Gymnasium's masks (B,) of valid entries."""
+    return info | dict.fromkeys([f"_{name}" for name in info], mask)
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":

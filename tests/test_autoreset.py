@@ -8,21 +8,12 @@ from gymnasium.vector import AutoresetMode
 torch = pytest.importorskip("torch")
 
 from ballbot_gym import Randomization  # noqa: E402
-from ballbot_gym.env import REWARD_PARTS  # noqa: E402
 from ballbot_gym.tasks import TASKS  # noqa: E402
 from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
 
 INFO = (
-    *REWARD_PARTS,
-    "cost",
-    "tilt",
-    "success",
-    "is_success",
-    "failure",
-    "violated",
-    "constraint_cost",
-    "force",
-    "clipped",
+    *("reward_survive", "reward_cost", "reward_goal", "cost", "tilt", "success", "is_success", "failure"),
+    *("violated", "constraint_cost", "force", "clipped"),
 )
 ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), position_noise=0.01, push_impulse=(0.0, 3.0))
 

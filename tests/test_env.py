@@ -17,12 +17,12 @@ from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv, Randomization
 from ballbot_gym.engines import installed_physics
-from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 
+REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 UPRIGHT = np.zeros(8)
 
 

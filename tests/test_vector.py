@@ -15,14 +15,13 @@ from ballbot_gym import batch as batch_module
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
-from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
 
 INFO = (
-    *("state", "cost", *REWARD_PARTS, "tilt", "success", "is_success", "failure", "violated", "constraint_cost"),
-    *("force", "clipped", "constants"),
+    *("state", "cost", "reward_survive", "reward_cost", "reward_goal", "tilt", "success", "is_success", "failure"),
+    *("violated", "constraint_cost", "force", "clipped", "constants"),
 )
 
 
