@@ -117,8 +117,7 @@ class PolicyNetwork(torch.nn.Module):
         return total / (1 + len(self._mirrors)) if self._mirrors else total
 
     def _seen(self, observation: torch.Tensor, plain: bool = False) -> tuple[Any, ...]:
-        """The numbers of an observation, and behind them the sides of routes, if any; then no gradient goes back."""
-        observation = observation if self.routes is None else observation.detach()
+        """The numbers of an observation, and behind them the sides of routes, if any."""
         numbers = tuple(observation.tolist()) if plain else observation.unbind(-1)
         return numbers if self.routes is None else (*numbers, *self.routes.sides(numbers))
 
