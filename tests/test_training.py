@@ -49,11 +49,11 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     assert after["certified/cost_ratio"] < 0.7 * before["certified/cost_ratio"]
 
 
-def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
+def test_shac_starts_from_a_policy_of_any_shape_and_robot_and_trains_its_critic_first():
     task, params = TASKS["turn"](), default_params()
     config = shac.ShacConfig(iterations=41, num_envs=4, horizon=2, hidden=(8,))
-    donor, learner = (shac.Shac(task, params, config, seed) for seed in (1, 2))
-    learner.start_from(donor.network)
+    donor = shac.Shac(task, params, config, 1)
+    learner = shac.Shac(task, params, replace(config, hidden=(9,)), 2, donor.network)
     assert torch.equal(parameters(learner), parameters(donor))
     for _ in range(40):
         learner.iterate()  # only the critic learns
@@ -61,9 +61,7 @@ def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
     donor.network.spec = replace(donor.network.spec, robot="rolling", task=replace(task, max_speed=3.0).problem())
-    shac.Shac(task, params, config).start_from(donor.network)
-    with pytest.raises(ValueError, match="cannot start"):
-        shac.Shac(task, params, replace(config, hidden=(9,))).start_from(donor.network)
+    assert shac.Shac(task, params, config, 2, donor.network).network.spec.robot == "paper"
 
 
 @pytest.mark.parametrize("setting", [{"one_way": True}, {"margin_clearance": 0.1}])

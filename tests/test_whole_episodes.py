@@ -10,25 +10,24 @@ from resuming import goes_on_as_if_never_stopped
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks import TASKS
-from ballbot_train.learning import whole_episodes
-from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners import LEARNERS, shac
 from ballbot_train.policy import load_network
 from ballbot_train.policy_files import shipped_policies
 
 
-def made(name, seed=0, robot="paper", **settings):
+def made(name, seed=0, robot="paper", start=None, **settings):
     small = {"horizon": 0, "iterations": 4, "num_envs": 4, "episode_seconds": 0.2, "hidden": (8,), "symmetry": "none"}
     settings = replace(LEARNERS["shac"].settings(name), **(small | settings))
-    return LEARNERS["shac"].make(make_task(name, robot), named_robot(robot), settings, seed, None)
+    return LEARNERS["shac"].make(make_task(name, robot), named_robot(robot), settings, seed, None, start)
 
 
 def test_it_goes_on_from_its_state_as_if_never_stopped():
     assert goes_on_as_if_never_stopped(lambda seed: made("turn", seed))
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name):
-    learner = made(name, num_envs=3, margin_clearance=0.2, margin_penalty=10.0)
+@pytest.mark.parametrize(("name", "symmetry"), [*((name, "none") for name in TASKS), ("weave", "routes")])
+def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name, symmetry):
+    learner = made(name, num_envs=3, symmetry=symmetry, margin_clearance=0.2, margin_penalty=10.0)
     weight = learner._trained.mlp[-1].bias
     state = learner._batch.state
     costs = []
@@ -46,10 +45,10 @@ def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name):
 
 
 def test_costs_are_those_of_the_policy_s_episodes(monkeypatch):
-    monkeypatch.setattr(whole_episodes, "_GOAL_PENALTY", 1e4)
-    monkeypatch.setattr(whole_episodes, "_GOAL_CLEARANCE", 0.0)
-    learner = made("turn", num_envs=16, episode_seconds=4.6)
-    learner.start_from(load_network(shipped_policies(make_task("turn"))["ppo"], make_task("turn")))
+    monkeypatch.setattr(shac, "_GOAL_PENALTY", 1e4)
+    monkeypatch.setattr(shac, "_GOAL_CLEARANCE", 0.0)
+    start = load_network(shipped_policies(make_task("turn"))["ppo"], make_task("turn"))
+    learner = made("turn", start=start, num_envs=16, episode_seconds=4.6)
     state = learner._batch.state
     costs, reached = learner._episodes()
     assert reached.all()
