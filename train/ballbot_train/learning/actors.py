@@ -1,14 +1,16 @@
 """The shapes of actors that respect the symmetry of their task, and running averages of actors."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch.optim.swa_utils import AveragedModel
 
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.policy_files import PolicySpec
 
@@ -74,19 +76,28 @@ def spec_for(
     )
 
 
-def started(network: PolicyNetwork, mine: PolicySpec, any_shape: bool = True) -> PolicyNetwork:
+def actor_for(
+    task: Task, params: BallbotParams, config: Any, history: int, informed: bool, start: PolicyNetwork | None
+) -> PolicyNetwork:
+    """A policy to train, of the config's symmetry and hidden layers, that starts as LQR; or `start` as `started` makes it."""
+    spec = spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params), informed)
+    if start is not None:
+        return started(start, spec)
+    made = PolicyNetwork(spec)
+    start_as_lqr(made, task, params)
+    return made
+
+
+def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
     """A policy to start from, perhaps of another robot and its episodes, for the task, robot and history of `mine`.
 
     What it sees or is told more it makes nothing of at first.
 
     Raises:
-        ValueError: it sees a longer past than `mine`, or is told more, or commands another number of motors; or its shape is
-            another, and not any is admitted.
+        ValueError: it sees a longer past than `mine`, or is told more, or commands another number of motors.
     """
     start, informed = network.spec, network.spec.informed or mine.informed
     spec = replace(start, task=mine.task, robot=mine.robot, history=mine.history, informed=informed)
-    if spec != mine and not any_shape:
-        raise ValueError(f"a policy of {start} cannot start one of {mine}; give --hidden or --symmetry")
     if start.history > mine.history:
         raise ValueError(f"the policy to start from sees {start.history} earlier observations; give --history")
     if spec.informed != mine.informed:

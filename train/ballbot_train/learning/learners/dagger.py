@@ -34,9 +34,9 @@ from ballbot_gym.robots import robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, spec_for, started
+from ballbot_train.learning.actors import RoutedSymmetry, actor_for
 from ballbot_train.learning.datasets import StreamedDemos, load_demos
-from ballbot_train.learning.fitting import Fit, Samples, start_as_lqr
+from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.shards import is_set
@@ -114,20 +114,16 @@ class Dagger:
         """As of `Algorithm.make`. Demonstrations are its first samples."""
         on_track, robot = randomization is not None or history > 0, robot_name(params)
         samples = _first_samples(demos, task, robot, config, seed, on_track)
-        self.config, self.iteration, self._warm = config, 0, False
+        self.config, self.iteration, self._warm = config, 0, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization or Randomization(), history
         torch.manual_seed(seed)
-        self.network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot))
-        start_as_lqr(self.network, task, params)
+        self.network = actor_for(task, params, config, history, False, start)
         self._fit = Fit(self.network)
         none = np.zeros((0, self.network.spec.seen))
         self._streamed = samples if isinstance(samples, StreamedDemos) else None
         self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, params.action_size)))
-        if start is not None:
-            self.network.load_state_dict(started(start, self.network.spec, any_shape=False).state_dict())
-            self._warm = True
 
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes

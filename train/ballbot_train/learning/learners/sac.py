@@ -251,7 +251,9 @@ class Sac(ModelFree):
         spec = spec_for(task, config.symmetry, config.hidden)
         frame = spec.seen_in
         spec = replace(spec, activation="silu", squash="tanh" if frame is None else "tanh_in_frame")
-        start = None if start is None else started(start, spec, any_shape=False)
+        start = None if start is None else started(start, spec)
+        if start is not None and start.spec != spec:
+            raise ValueError(f"a policy of {start.spec} cannot start one of {spec}; give --hidden or --symmetry")
         given = None if demos is None else load_demos(demos, task, robot_name(params))
         if given is not None and task.first_exit:
             given = given.without_pay(task, FAILURE_PRICE)

@@ -29,12 +29,10 @@ from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import robot_name
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, average_of, spec_for, started
-from ballbot_train.learning.fitting import start_as_lqr
+from ballbot_train.learning.actors import RoutedSymmetry, actor_for, average_of
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
@@ -171,10 +169,7 @@ class _ExactGradient:
         torch.manual_seed(seed)  # for the networks' first weights
         self.config, self.iteration, self._own, self._seed, self._warm = config, 0, task, seed, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
-        spec = spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params), informed)
-        self._trained = PolicyNetwork(spec) if start is None else started(start, spec)
-        if start is None:
-            start_as_lqr(self._trained, task, params)
+        self._trained = actor_for(task, params, config, history, informed, start)
         self._optimizer = torch.optim.Adam(self._trained.parameters(), config.learning_rate, betas=self._BETAS)
         # no window ends an episode
         self.task = replace(task, duration=_ENDLESS * task.control_dt if config.horizon else config.episode_seconds)
