@@ -1,5 +1,4 @@
-"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table; motions with a
-picture.
+"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table.
 
 Their 3D replays and figures are drawn by `ballbot_train.report`, which is imported when it is asked for.
 """
@@ -29,9 +28,6 @@ class Displayed:
     def _table(self) -> dict[str, str]:
         return self.facts()
 
-    def _picture(self) -> str:
-        return ""
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{name} {value}' for name, value in self.facts().items())})"
 
@@ -41,8 +37,7 @@ class Displayed:
             cell.format("h", html.escape(name)) + cell.format("d", html.escape(value))
             for name, value in self._table().items()
         )
-        table = "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
-        return f'<div style="display:flex;flex-wrap:wrap;align-items:center;gap:1em">{table}{self._picture()}</div>'
+        return "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
 
 
 class Moving(Displayed):
@@ -55,12 +50,6 @@ class Moving(Displayed):
 
     def _table(self) -> dict[str, str]:
         return self.facts() | self.motion.facts()
-
-    def _picture(self) -> str:
-        try:
-            return lazy.load("ballbot_train.report.notebook:as_image")(self.plot())
-        except ModuleNotFoundError:  # what draws is not installed
-            return ""
 
     def show(self, *others: Moving, labels: Sequence[str] = (), robot: str | BallbotParams = "paper") -> Path | None:
         """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.

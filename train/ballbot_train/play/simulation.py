@@ -130,12 +130,14 @@ class Runner:
             raise FloatingPointError(f"it commands {u} N")
         return u
 
-    def step(self, command: np.ndarray, push: np.ndarray) -> None:
-        """Holds a command (2,), N, for one control step, after a push (2,), N·s, on the body's centre of mass."""
-        if push.any():
-            pushed = dynamics.pushed(self.env.episode_params, self.x, tuple(push.tolist()))
-            self.states[-1] = tuple(map(float, pushed))
-            self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
+    def push(self, impulse: np.ndarray) -> None:
+        """Pushes the body's centre of mass by an impulse (2,), N·s."""
+        pushed = dynamics.pushed(self.env.episode_params, self.x, tuple(impulse.tolist()))
+        self.states[-1] = tuple(map(float, pushed))
+        self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
+
+    def step(self, command: np.ndarray) -> None:
+        """Holds a command (2,), N, for one control step."""
         _, _, terminated, _, info = self.env.step(command / self.env.params.force_limit)
         self.states.append(tuple(info["state"].tolist()) if np.isfinite(info["state"]).all() else self.x)
         self.forces.append(tuple(info["force"].tolist()))
@@ -276,16 +278,13 @@ class Playground:
         dt = self.world.task.control_dt
         if self.episode == "rest" and self.elapsed == round(_FIRST_PUSH_AFTER / dt):
             self.push(*(part * self.world.params.total_mass / default_params().total_mass for part in FIRST_PUSH))
-        push, self._pending_push = self._pending_push, np.zeros(2)
-        if push.any():
-            self._push, self._push_until = push, self.elapsed + round(_PUSH_SHOWN / dt)
         for runner in self.runners:
             if not runner.stands_still:
                 try:
                     command = runner.command(self.seconds)
                 except Exception as error:  # a controller of any kind, such as a policy: the others go on
                     self.notice, command = f"{labels.label(runner.name)}: {error}", np.zeros(2)
-                runner.step(command, push)
+                runner.step(command)
         self.elapsed += 1
         if self.elapsed >= self.world.task.steps or self.main.stands_still:
             self._end()
@@ -298,11 +297,15 @@ class Playground:
     # --- what a user does ---
 
     def push(self, x: float, y: float) -> None:
-        """Pushes every robot by an impulse along x and y, N·s, on its body's centre of mass, before the next control step."""
+        """Pushes every robot by an impulse along x and y, N·s, on its body's centre of mass."""
         length = math.hypot(x, y)
         if not math.isfinite(length):
             raise ValueError(f"a push must be finite numbers, not {x} and {y}")
-        self._pending_push = self._pending_push + np.array([x, y]) * (LARGEST_PUSH / max(length, LARGEST_PUSH))
+        self._push = np.array([x, y]) * (LARGEST_PUSH / max(length, LARGEST_PUSH))
+        self._push_until = self.elapsed + round(_PUSH_SHOWN / self.world.task.control_dt)
+        for runner in self.runners:
+            if not runner.stands_still:
+                runner.push(self._push)
 
     def set_world(self, task: str | None = None, robot: str | None = None) -> None:
         """Another task, or another robot, under the same controllers where they are made for it."""
@@ -376,7 +379,6 @@ class Playground:
         """Begins an episode. A controller that finds no plan is replaced by LQR."""
         self.start, self.episode = start, episode
         self.elapsed = self._pause_left = self._push_until = 0
-        self._pending_push = self._push = np.zeros(2)
         seed = int(self._rng.integers(2**32))  # the same for all, so that they meet the same robot, noise and pushes
         for runner in self.runners:
             runner.begin(start, seed)

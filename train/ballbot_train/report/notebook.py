@@ -1,8 +1,6 @@
 """`show` and `plot` of trajectories, episodes and optima: 3D replays, below a notebook's cell too, and figures."""
 
-import base64
 import html
-import io
 import sys
 import tempfile
 import webbrowser
@@ -44,13 +42,6 @@ def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Bal
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
     """See `ballbot_gym.display.Moving.plot`."""
     return _figure(figures.trajectory_figure("", _takes(shown, names), _markers(shown)))
-
-
-def as_image(figure: Figure) -> str:
-    """A small picture of a figure, as HTML."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="webp", dpi=55)
-    return f'<img alt="the figure" src="data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
 
 
 def _takes(shown: Sequence[Moving], names: Sequence[str]) -> list[Take]:

@@ -28,10 +28,6 @@ class Playground extends Player {
     this.setRobot(KNOWN, 0);
   }
 
-  say(text) {
-    this.find("said").textContent = text;
-  }
-
   /** The robot's factors, from the sliders unless they are given, and the scenario anew. */
   setRobot(factors = null, index = this.index) {
     this.sliders.forEach((slider, i) => {
@@ -56,7 +52,6 @@ class Playground extends Player {
     this.find("text").textContent = driven
       ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture."
       : `${this.scenario.text} Drag a robot to push it, or the floor to look around.`;
-    this.say("");
     this.find("drive").setAttribute("aria-pressed", driven);
     this.driver = driven ? new Driver() : null;
     this.held = new Set(); // keys
@@ -101,17 +96,7 @@ class Playground extends Player {
     }
     for (const robot of this.everyone) robot.advance();
     this.time += DATA.dt;
-    if (this.driver && this.robots[0].over) this.finish();
-  }
-
-  /** The end of an episode that the reader has driven. */
-  finish() {
-    this.setPlaying(false);
-    const [mine] = this.robots;
-    if (!mine.failed && !this.best) return this.say(`It cost ${mine.cost.toFixed(1)}. The optimum of this robot is not in the page.`);
-    if (mine.failed) return this.say(`You ${verdict(mine)} after ${(mine.steps * DATA.dt).toFixed(1)} s. Restart to try again.`);
-    const policy = this.regret(this.robots[1]);
-    this.say(`Your regret is ${this.share100(mine).toFixed(1)} %.${policy ? ` The policy's: ${policy.replace("regret ", "")}.` : ""}`);
+    if (this.driver && this.robots[0].over) this.setPlaying(false);
   }
 
   /** A push for everyone. Where somebody has fallen, all start again first. */
@@ -215,15 +200,9 @@ class Playground extends Player {
   /** How much more than the optimum an undisturbed robot has cost so far, or in all once its episode is over. */
   regret(robot) {
     if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
-    const share = this.share100(robot);
-    return robot.over ? `regret ${share.toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
-  }
-
-  /** The same as a number, %; nothing costs less than the optimum over a whole episode. */
-  share100(robot) {
-    const over = robot.over;
-    const share = 100 * (robot.cost / (over ? this.scenario.optimum : this.best.cost) - 1);
-    return over ? Math.max(0, share) : share;
+    const share = 100 * (robot.cost / (robot.over ? this.scenario.optimum : this.best.cost) - 1);
+    // nothing costs less than the optimum over a whole episode
+    return robot.over ? `regret ${Math.max(0, share).toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
   }
 
   /** Pointers and keys. A drag that begins at a robot pushes, any other turns the camera; time stands still while one pulls. */
@@ -314,23 +293,16 @@ class Playground extends Player {
     const to = this.scene.unproject(pixel, height);
     if (!from || !to) return this.drag.pull;
     const impulse = shortened(Vector.times(Vector.minus(to, from).slice(0, 2), 1 / DATA.push_scale), STRONGEST);
-    const size = Math.hypot(...impulse);
-    if (size < 3) return null;
-    this.say(`a push of ${size.toFixed(0)} N·s`);
-    return impulse;
+    return Math.hypot(...impulse) < 3 ? null : impulse;
   }
 }
 
 /** A vector that is at most so long. */
 const shortened = (vector, longest) => Vector.times(vector, Math.min(1, longest / Math.hypot(...vector)));
 
+const ENDS = { goal: "arrived", tilt: "fell", arena: "ran away", force: "gave no number" };
+
 /** How a robot's episode ended, in a word; "" while it goes on. */
-function verdict(robot) {
-  if (robot.ended === "goal") return "arrived";
-  if (robot.ended === "tilt") return "fell";
-  if (robot.ended === "arena") return "ran away";
-  if (robot.ended === "force") return "gave no number";
-  return robot.failed ? "touched" : "";
-}
+const verdict = (robot) => ENDS[robot.ended] ?? (robot.failed ? "touched" : "");
 
 const playground = new Playground();
