@@ -360,7 +360,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--commands", nargs="*", choices=list(COMMANDS), default=list(COMMANDS))
     options = parser.parse_args()
-    os.environ.pop("BALLBOT_IN_PROCESS", None)
     os.environ |= {"BALLBOT_CHECKPOINT_SECONDS": "0", "OMP_NUM_THREADS": "1"}
     _import_libraries()
     failed = []

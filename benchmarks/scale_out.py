@@ -5,7 +5,7 @@
 
 | part | measures |
 |---|---|
-| overhead | time from item to item less that in the item, on one worker: items that sleep 1 ms to 1 s, in jobs of 1 and 5 |
+| overhead | time from item to item less that in the item, here and on one node: items of 1 ms to 1 s, in jobs of 1 and 5 |
 | throughput | items a second with 1, 2 and 4 workers: items that compute, and items that sleep |
 | driver | CPU time of this process per item, and the items a second that it takes: entries of 40 kB, as of an optimum |
 | kill | two Ray nodes on this machine, one killed after a quarter of the items: all arrive once, as one process makes them |
@@ -26,7 +26,6 @@ from typing import Any
 os.environ.setdefault("RAY_worker_niceness", "0")
 
 import numpy as np
-import ray
 import tyro
 from ray.cluster_utils import Cluster
 
@@ -71,8 +70,6 @@ def cluster(*cores: int) -> Iterator[Cluster]:
     try:
         yield made
     finally:
-        if ray.is_initialized():
-            ray.shutdown()
         made.shutdown()
 
 
@@ -110,15 +107,11 @@ def executors(address: str, count: int) -> dict[str, Workers]:
 def overhead() -> list[Row]:
     rows = []
     with cluster(1) as made:
-        ray.init(made.address, logging_level="ERROR", log_to_driver=False)
         for seconds in (0.001, 0.01, 0.1, 1.0):
             n = int(np.clip(4 / seconds, 5, 200) // 10 * 10) or 10
             for batch in (1, 5):
-                for name, workers in {"serial": Workers(1), **executors(made.address, 1)}.items():
-                    if name == "serial":
-                        os.environ["BALLBOT_IN_PROCESS"] = "1"
+                for name, workers in {"this process": Workers(1), "ray": Workers(ray=made.address)}.items():
                     period, inside = timed(sleeping, seconds, n, batch, workers, 1)
-                    os.environ.pop("BALLBOT_IN_PROCESS", None)
                     rows.append(
                         {
                             "executor": name,
@@ -136,7 +129,6 @@ def throughput() -> list[Row]:
     rows = []
     for count in (1, 2, 4):
         with cluster(*[1] * count) as made:
-            ray.init(made.address, logging_level="ERROR", log_to_driver=False)
             for name, workers in executors(made.address, count).items():
                 for function, argument in ((sleeping, 0.1), (computing, _LOOPS)):
                     period, inside = timed(function, argument, 80, 4, workers, count)
@@ -162,7 +154,6 @@ def heavy(kilobytes: int, items: Sequence[int]) -> Iterator[jobs.Entry]:
 def driver() -> list[Row]:
     rows = []
     with cluster(1, 1) as made:
-        ray.init(made.address, logging_level="ERROR", log_to_driver=False)
         for name, workers in executors(made.address, 2).items():
             began, spent = time.perf_counter(), time.process_time()
             period, _ = timed(heavy, 40, 1000, 5, workers, 2)

@@ -8,8 +8,6 @@ import sys
 # Before torch is imported, here and in the processes that tests start: nothing in them is big enough for a second thread,
 # and on busy cores threads wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# One worker is this process, so that tests can replace what it calls, and need not wait for another one to start.
-os.environ.setdefault("BALLBOT_IN_PROCESS", "1")
 
 import gymnasium
 import numpy as np

@@ -98,11 +98,8 @@ def test_entry_points_are_found_where_the_package_is_installed(module, light, tm
         assert "reach: ballbot_gym.tasks 'broken' (no_such_module:Task) fails" in ran.stderr
 
 
-def test_commands_take_a_module_and_a_urdf_and_compute_optima_in_workers(
-    typed, module, light, interpreted, monkeypatch
-):
-    monkeypatch.delenv("BALLBOT_IN_PROCESS")
-    options = ("--controllers", "lqr", "--episodes", 2, "--physics", "rk4", "--workers", 1, "--out", "out")
+def test_commands_take_a_module_and_a_urdf_and_compute_optima_in_workers(typed, module, light, interpreted):
+    options = ("--controllers", "lqr", "--episodes", 2, "--physics", "rk4", "--workers", 2, "--out", "out")
     ended, printed = typed("benchmark", "--tasks", f"{module}:reach", "--robot", light, *options)
     assert ended == 0, printed
     known = certified.load("reach", "light", episodes=[0, 1])

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
+from importlib import import_module
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
@@ -48,18 +48,19 @@ class Workers:
     ray: str | None = None
     """Address of a Ray cluster, HOST:PORT, "auto" or "local"."""
 
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, not {self.workers}")
+        if self.ray is not None and self.ray.startswith("ray://"):
+            raise ValueError(
+                f"{self.ray} is the address of a Ray client, which is not supported; run the command on a "
+                "node of the cluster with --ray auto, for example by `ray job submit`"
+            )
+
     @classmethod
     def of(cls, workers: "int | Workers") -> "Workers":
         """A number of processes as workers; raises a ValueError where there are none."""
-        workers = workers if isinstance(workers, Workers) else cls(workers)
-        if workers.workers is not None and workers.workers < 1:
-            raise ValueError(f"workers must be at least 1, not {workers.workers}")
-        if workers.ray is not None and workers.ray.startswith("ray://"):
-            raise ValueError(
-                f"{workers.ray} is the address of a Ray client, which is not supported; run the command on a "
-                "node of the cluster with --ray auto, for example by `ray job submit`"
-            )
-        return workers
+        return workers if isinstance(workers, Workers) else cls(workers)
 
     @property
     def here(self) -> int:
@@ -71,21 +72,20 @@ Task = tuple[Key, Callable[..., Any], tuple[Any, ...]]
 """What tells a task from others, and a function of a module with its arguments."""
 
 
-def completed(tasks: Iterable[Task[Key]], workers: int | Workers, serial: bool = False) -> Iterator[tuple[Key, Any]]:
+def completed(tasks: Iterable[Task[Key]], workers: int | Workers) -> Iterator[tuple[Key, Any]]:
     """Does tasks on workers, and gives the result of each when it is there, with the task's key.
 
     Args:
         tasks: what there is to do. They are taken when workers have room for them, so that few are in memory.
-        workers: a number of processes of this machine, or `Workers`. Where there is nothing to do, none starts. With
-            $BALLBOT_IN_PROCESS set, 1 process is this one, for debuggers and tests.
-        serial: 1 process is this one in any case.
+        workers: a number of processes of this machine, or `Workers`. 1 process is this one. Where there is nothing to do,
+            none starts.
 
     Raises:
         WorkerError: a worker died, or there is no cluster.
         Exception: what a task raised, once the results are given that came with it.
     """
     workers, tasks = Workers.of(workers), iter(tasks)
-    if workers.here == 1 and (serial or os.environ.get("BALLBOT_IN_PROCESS")):
+    if workers.here == 1:
         for key, function, arguments in tasks:
             yield key, function(*arguments)
         return
@@ -174,7 +174,7 @@ def _end_with_the_run() -> None:
 
 @contextmanager
 def _cluster(workers: Workers) -> Iterator[Pool]:
-    """Tasks of one core each on a Ray cluster. Connects to the cluster, unless this process is connected to one already.
+    """Tasks of one core each on a Ray cluster, to which this process must not be connected.
 
     Raises:
         ModuleNotFoundError: Ray is not installed.
@@ -182,30 +182,18 @@ def _cluster(workers: Workers) -> Iterator[Pool]:
     """
     with imports_of("--ray", "ray"):
         import ray  # pyright: ignore[reportMissingImports]
-    connected, running = ray.is_initialized(), set[Future]()
     with TemporaryDirectory() as folder:
-        if not connected:
-            _connect(ray, workers, Path(folder))
+        _connect(ray, workers, Path(folder))
         # a name with a module, so that nodes import the function rather than unpickle it
         task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_attempt)
-
-        def submit(*given: Any) -> Future:
-            future = task.remote(*given).future()
-            running.add(future)
-            future.add_done_callback(running.discard)
-            return future
 
         def most() -> int:  # nodes come and go
             return workers.workers or max(1, _PER_CORE * int(ray.cluster_resources().get("CPU", 0)))
 
         try:
-            yield submit, most
+            yield (lambda *given: task.remote(*given).future()), most
         finally:
-            if not connected:
-                ray.shutdown()  # which ends the tasks too
-            else:
-                for future in list(running):
-                    ray.cancel(future.object_ref, force=True)  # pyright: ignore[reportAttributeAccessIssue] Ray's own
+            ray.shutdown()  # which ends the tasks too
 
 
 def _connect(ray: Any, workers: Workers, folder: Path) -> None:
@@ -225,23 +213,16 @@ def _connect(ray: Any, workers: Workers, folder: Path) -> None:
         ) from error
 
 
-def _code(folder: Path) -> list[str]:
-    """Copies our packages, as a wheel holds them, and modules with users' tasks, for the nodes; says where. Their
-    dependencies are not among them.
+def _code(folder: Path) -> list[Any]:
+    """Our packages and modules with users' tasks, for the nodes. Their dependencies are not among them.
+
+    The package that reads URDFs is copied with them, as a wheel holds it.
     """
+    import ballbot_gym
     from ballbot_gym.params import URDF_FOLDER
 
-    found = []
-    modules = (name.partition(".")[0] for name in registry.registered()[0])
-    for name in dict.fromkeys(("ballbot_gym", "ballbot_baselines", "ballbot_train", *modules)):
-        spec = find_spec(name)
-        assert spec is not None
-        assert spec.origin is not None
-        path = Path(spec.origin)
-        found.append(str(folder / (name if path.stem == "__init__" else path.name)))
-        if path.stem == "__init__":
-            shutil.copytree(path.parent, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(path, folder)
-    shutil.copytree(URDF_FOLDER, folder / "ballbot_gym" / "urdf", dirs_exist_ok=True)
-    return found
+    ours, copied = ("ballbot_baselines", "ballbot_train"), folder / "ballbot_gym"
+    shutil.copytree(Path(ballbot_gym.__file__).parent, copied, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(URDF_FOLDER, copied / "urdf", dirs_exist_ok=True)
+    users = (name.partition(".")[0] for name in registry.registered()[0])
+    return [str(copied), *map(import_module, dict.fromkeys([*ours, *users]))]

@@ -169,8 +169,7 @@ def run(
     Args:
         jobs: what there is to do.
         out: folder of the results, which the caller has claimed; unfinished ones are in a folder within.
-        workers: a number of processes, or `Workers`. The calling process does no job itself, so that it outlives any of
-            them; see `completed`.
+        workers: a number of processes, or `Workers`; see `completed`.
         on_progress: called with a job's group and a number of its items that are there; default, a bar for each group.
 
     Returns:

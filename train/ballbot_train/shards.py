@@ -50,31 +50,25 @@ class Shards:
             FileError: the manifest is damaged, or nothing can be read there.
         """
         self.url = str(url).rstrip("/")
+        self.about: dict[str, Any] | None = None
+        """What the set was made from; None where there is none yet."""
+        self._shards: dict[int, dict[str, Any]] = {}
         try:
             self._files, self._root = fsspec.core.url_to_fs(self.url)
             text = self._content(MANIFEST, files.JSON_LIMIT)
         except FileNotFoundError:
-            text = None
+            return
         except (ImportError, ValueError, OSError) as error:
             raise files.FileError(f"{self.url} cannot be read: {error}") from error
-        self.about: dict[str, Any] | None = None
-        """What the set was made from; None where there is none yet."""
-        self._shards: dict[int, dict[str, Any]] = {}
-        if text is not None:
-            self._parse(text)
-
-    def _parse(self, text: bytes) -> None:
         try:
             manifest = files.read_json(MANIFEST, content=text)
             if manifest["version"] != _VERSION:
                 raise ValueError(f"version {manifest['version']}")
             self.about = dict(manifest["about"])
-            self._shards = {int(i): dict(shard) for i, shard in manifest["shards"].items()}
-            for i, shard in self._shards.items():
-                known = isinstance(shard["sha256"], str) and type(shard["episodes"]) is int
-                if shard["file"] != _name(i) or not known or shard["episodes"] < 0:
-                    raise ValueError(f"shard {i}")
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            for i, shard in manifest["shards"].items():
+                known = {"episodes": int(shard["episodes"]), "sha256": str(shard["sha256"])}
+                self._shards[int(i)] = shard | known
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise files.FileError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
 
     @property
@@ -87,9 +81,9 @@ class Shards:
         """Of all finished shards."""
         return sum(shard["episodes"] for shard in self._shards.values())
 
-    def episodes_of(self, number: int) -> int:
-        """Of one finished shard."""
-        return self._shards[number]["episodes"]
+    def has(self, number: int, episodes: int) -> bool:
+        """Whether a shard is finished, with so many episodes."""
+        return number in self._shards and self._shards[number]["episodes"] == episodes
 
     def read(self, number: int) -> dict[str, np.ndarray]:
         """The arrays of a shard.
@@ -97,13 +91,12 @@ class Shards:
         Raises:
             FileError: the shard is missing, or is not the one of the manifest.
         """
-        shard = self._shards[number]
-        path = f"{self.url}/{shard['file']}"
+        path = f"{self.url}/{_name(number)}"
         try:
-            content = self._content(shard["file"], _LIMIT)
+            content = self._content(_name(number), _LIMIT)
         except (OSError, files.FileError) as error:
             raise files.FileError(f"{path} cannot be read: {error}") from error
-        if hashlib.sha256(content).hexdigest() != shard["sha256"]:
+        if hashlib.sha256(content).hexdigest() != self._shards[number]["sha256"]:
             raise files.FileError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
         return files.read_npz(path, _LIMIT, content)
 
@@ -201,11 +194,9 @@ def make(
     def missing() -> Iterator[Any]:
         for shard in range(-(-episodes // per_shard)):
             parts = parts_of(shard)
-            if shard in shards.numbers and shards.episodes_of(shard) == sum(map(len, parts)):
-                advance(named, sum(map(len, parts)))
-                continue
+            finished = shards.has(shard, sum(map(len, parts)))
             for part, path in parts.items():
-                if path.exists():
+                if finished or path.exists():
                     advance(named, len(part))
                 else:
                     yield part, function, (part,)

@@ -48,7 +48,6 @@ def certify(
     """
     check_some("task", tasks, TASKS)
     check_least(1, episodes=episodes)
-    Workers.of(workers)
     most = _MOST_EPISODES if shards is None else _MOST_IN_SHARDS
     if episodes > most:
         raise ValueError(

@@ -55,7 +55,6 @@ def evaluate(
     task = task_name(policy, task, robot)
     controllers_of([task], [policy], robot)
     check_least(0, optima=optima)
-    Workers.of(workers)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
     named = f"{task}-{Path(policy).stem}" + (f"-on-{randomization}" if randomization else "")

@@ -96,7 +96,7 @@ def evaluate(
     name: str | None = None,
     randomization: Randomization | str | None = None,
     robot: str | BallbotParams = PAPER,
-    workers: int | Workers | None = None,
+    workers: int | Workers = 1,
     out: str | Path | None = None,
 ) -> Row:
     """The leaderboard row of anything that acts.

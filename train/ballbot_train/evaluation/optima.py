@@ -36,7 +36,7 @@ def known(
     task: str | Task,
     robot: str | BallbotParams = PAPER,
     episodes: Iterable[int] | None = None,
-    workers: int | Workers | None = None,
+    workers: int | Workers = 1,
     randomization: Randomization = Randomization(),
 ) -> certified.EvaluationSet:
     """The evaluation set of a task and a robot, with the optima of some episodes at least. What is missing is computed.
@@ -45,7 +45,7 @@ def known(
         task: a name in `TASKS`, or any Task.
         robot: a name in `ROBOTS`, or any BallbotParams.
         episodes: their indices; default, the first 200.
-        workers: processes that compute, or `Workers`; default, this process alone.
+        workers: processes that compute, or `Workers`.
         randomization: what the robots and actuators of the episodes are drawn from.
 
     Raises:
@@ -69,7 +69,7 @@ def compute(
     task: Task,
     params: BallbotParams,
     episodes: Iterable[int],
-    workers: int | Workers | None = None,
+    workers: int | Workers = 1,
     randomization: Randomization = Randomization(),
 ) -> None:
     """Computes the optima of episodes that the user's cache lacks. Each is kept as soon as it is found.
@@ -79,7 +79,7 @@ def compute(
     Args:
         task: and params: the problem.
         episodes: their indices.
-        workers: processes that compute, or `Workers`; default, this process alone.
+        workers: processes that compute, or `Workers`.
         randomization: as of `known`.
 
     Raises:
@@ -110,7 +110,11 @@ def compute(
             each = min(AT_ONCE, -(-len(missing) // _TASKS))
             parts = (missing[k : k + each] for k in range(0, len(missing), each))
             work = ((part, _solved, (solve, part)) for part in parts)
-            solved = [solve(missing)] if workers is None else (entries for _, entries in completed(work, workers))
+            solved = (
+                [solve(missing)]
+                if Workers.of(workers).here == 1
+                else (entries for _, entries in completed(work, workers))
+            )
             for index, found in itertools.chain.from_iterable(solved):
                 advance(name, 1)
                 if isinstance(found, str):

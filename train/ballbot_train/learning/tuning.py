@@ -118,7 +118,7 @@ def run(
         search: what is searched.
         trials: how many, pruned and failed ones included.
         out: folder of the search.
-        workers: a number of processes, or `Workers`; each runs a trial at a time. One process is this one, and then the same
+        workers: a number of processes, or `Workers`; each runs a trial at a time. With one process the same
             search proposes the same trials. With more, proposals depend on which trials have ended before.
 
     Returns:
@@ -146,7 +146,7 @@ def run(
 
         with progress_bars({named: trials}) as advance:
             advance(named, begun)
-            for trial, reached in executors.completed(tasks(), workers, serial=True):
+            for trial, reached in executors.completed(tasks(), workers):
                 _end(study, trial, reached)
                 write_best(study, search, out)
                 advance(named, 1)
