@@ -1,6 +1,7 @@
 import csv
 import json
 import math
+import pickle
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import benchmark, evaluate
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.controllers import make_controller, make_packed, packed
+from ballbot_train.evaluation.controllers import make_controller, portable
 from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.policy import PolicyNetwork, save_policy
 from ballbot_train.policy_files import PolicySpec, shipped_policies
@@ -162,21 +163,21 @@ def test_an_import_loads_only_what_it_needs():
     assert run.stdout.splitlines() == [str(loaded) for _, loaded in IMPORTS]
 
 
-def test_the_files_of_a_policy_are_all_that_a_worker_needs(tmp_path):
+def test_a_worker_needs_no_file_of_a_policy(tmp_path):
     source = shipped_policies(make_task("turn"))["dagger"]
     for ending in (".json", ".safetensors"):
         shutil.copy(source.with_suffix(ending), tmp_path / f"mine{ending}")
     path, task, params = str(tmp_path / "mine.json"), make_task("turn"), default_params()
-    files = packed(path)
     expected = make_controller(path, task, params)
+    sent = pickle.dumps(portable(path, task, params))
     for each in tmp_path.iterdir():
         each.unlink()
-    controller = make_packed(path, files, task, params)
+    controller = pickle.loads(sent)
     x, c = np.zeros(8), np.array([3.0])
     for made in (expected, controller):
         made.reset(0.0, x, c)
     assert np.array_equal(controller.act(0.0, x), expected.act(0.0, x))
-    assert packed("lqr") == packed("dagger") == {}
+    assert [portable(name, task, params) for name in ("lqr", "dagger")] == ["lqr", "dagger"]
 
 
 def test_whatever_is_evaluated_can_be_compared(tmp_path):

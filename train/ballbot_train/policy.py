@@ -178,10 +178,13 @@ class PolicyController(ActionController):
     def __init__(self, task: Task, params: BallbotParams, network: torch.nn.Module):
         """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
         history = network.spec.history if isinstance(network, PolicyNetwork) else 0
-        super().__init__(task, params, lambda observation, begins: self.predict(observation)[0], history)
+        super().__init__(task, params, self._action_for, history)
         self.network = network.eval()
         if isinstance(network, PolicyNetwork) and network.spec.informed:
             self.told = np.ones(_TOLD)
+
+    def _action_for(self, observation: np.ndarray, begins: bool) -> np.ndarray:
+        return self.predict(observation)[0]
 
     def predict(
         self,

@@ -18,9 +18,10 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER, named_robot
-from ballbot_gym.rollout import PlanError, rollout
+from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import make_packed, packed
+from ballbot_train.evaluation.controllers import portable
+from ballbot_train.evaluation.evaluate import as_controller
 from ballbot_train.executors import Workers
 
 TASK = "stabilize"
@@ -111,7 +112,8 @@ def cell_jobs(
     for name, boundary in bounds.items():
         worth = _within(boundary, *grid(name, points), _DOUBT)
         for controller in controllers:
-            arguments = name, controller, physics, points, packed(controller), robot
+            sent = portable(controller, make_task(TASK, robot), named_robot(robot))
+            arguments = name, controller, physics, points, sent, robot
             for i in range(points // 2, points):
                 items = tuple((i, int(j)) for j in np.flatnonzero(worth[i]))
                 stem = f"{name}-{controller}-{physics}-{points}-{i:02d}"
@@ -124,12 +126,12 @@ def _cells(
     controller: str,
     physics: str,
     points: int,
-    policy_files: Mapping[str, bytes],
+    sent: str | Controller,
     robot: str,
     items: Sequence[tuple[int, int]],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(TASK, physics=physics, robot=robot, arena_radius=_ARENA_RADIUS)
-    made = make_packed(controller, policy_files, env.task, env.params)
+    made = as_controller(sent, env.task, env.params)
     leans, values = grid(axis, points)
     for i, j in items:
         x = np.zeros(env.params.state_size)

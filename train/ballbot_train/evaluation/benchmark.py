@@ -15,12 +15,13 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
-from ballbot_gym.tasks import TASKS
+from ballbot_gym.rollout import Controller
+from ballbot_gym.tasks import TASKS, Task
 from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some, markdown, print_table
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.evaluate import run_episodes, shown_to
+from ballbot_train.evaluation.evaluate import as_controller, run_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
@@ -158,6 +159,12 @@ class Group:
         """Whose optima its regret is over."""
         return self.task, self.robot, self.randomization if self.own_optima else Randomization()
 
+    @property
+    def believed(self) -> tuple[Task, BallbotParams]:
+        """What the controller is made for."""
+        made_for = self.made_for or self.robot
+        return make_task(self.task, made_for), named_robot(made_for)
+
 
 def run_groups(
     groups: Sequence[Group],
@@ -194,11 +201,12 @@ def run_groups(
                 [*map(str, (group.task, group.controller, group.physics, *group.told.values())), f"{part.start:03d}"]
             ),
             function=_episode_entries,
-            arguments=(group, registry.packed(group.controller), seed, known[group.problem], recorded[group.robot]),
+            arguments=(group, sent, seed, known[group.problem], recorded[group.robot]),
             items=tuple(part),
             group=group.counts_for or group.task,
         )
         for group in groups
+        for sent in [registry.portable(group.controller, *group.believed)]
         for part in parts
     ]
     done, results = iter(jobs.run(work, out, workers)), []
@@ -215,17 +223,15 @@ def run_groups(
 
 def _episode_entries(
     group: Group,
-    packed: Mapping[str, bytes],
+    sent: str | Controller,
     seed: int,
     known: certified.EvaluationSet,
     record: bool,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     robot = group.robot if group.friction is None else floor(group.robot, group.friction)
-    made_for = group.made_for or group.robot
     env = BallbotEnv(group.task, physics=group.physics, randomization=group.randomization, robot=robot)
-    believed = make_task(group.task, made_for), named_robot(made_for)
-    made = registry.make_packed(group.controller, packed, *believed)
+    made = as_controller(sent, *group.believed)
     env = shown_to(made, env)
     motions: list[recordings.Recording] = []
     results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)

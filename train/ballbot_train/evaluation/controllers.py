@@ -1,11 +1,8 @@
 """Controllers by name: experts of `CONTROLLERS`, policies that come with the package, policy files and saved models."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ballbot_baselines import CONTROLLERS, FILTERS, VARIANTS
-from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
@@ -16,8 +13,6 @@ from ballbot_train.policy_files import read_description, shipped_policies, weigh
 
 FILTERED = "-ekf"
 """Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
-
-_BESIDE = (".json", ".safetensors")  # endings of the files of a policy
 
 
 def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
@@ -140,27 +135,12 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
     return Path(name)
 
 
-def packed(name: str) -> dict[str, bytes]:
-    """The files of a policy or a saved model by name, for workers that do not have them; empty for other controllers.
+def portable(name: str, task: Task, params: BallbotParams) -> str | Controller:
+    """The controller of a file, to be sent to workers that do not have the file. Other names stay names.
 
-    Raises:
-        FileError: the file is missing.
+    Raises: as `make_controller`.
     """
-    if not is_file(name):
-        return {}
-    path = Path(plain(name))
-    beside = (path.with_name(path.stem + ending) for ending in _BESIDE)
-    return {each.name: files.read(each) for each in {path, *beside} if each == path or each.exists()}
-
-
-def make_packed(name: str, packed: Mapping[str, bytes], task: Task, params: BallbotParams) -> Controller:
-    """As `make_controller`, with the files that `packed` gave."""
-    if not packed:
-        return make_controller(name, task, params)
-    with TemporaryDirectory() as folder:
-        for each, content in packed.items():
-            (Path(folder) / each).write_bytes(content)
-        return make_controller(str(Path(folder) / Path(name).name), task, params)
+    return make_controller(name, task, params) if is_file(name) else name
 
 
 def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
