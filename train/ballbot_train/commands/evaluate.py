@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.randomization import Randomization, checked_randomization, track_of
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
@@ -45,7 +45,7 @@ def evaluate(
         fresh: how many fresh episodes, in the batched closed-form model. They are never the certified ones.
         seed: of the fresh episodes.
         optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
-            folder `optima` beside --out, for later calls and other policies.
+            user's cache folder, for later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
         workers: who finds optima.
         robot: whose episodes.
@@ -77,9 +77,7 @@ def evaluate(
         progress = partial(advance, "episodes")
         result = episodes.evaluate_fresh(policy, task, fresh, seed, None, progress, robot, varied)
     if optima:
-        track = f"-{track_of(varied)}" if varied.moves_optima else ""
-        folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
-        result = replace(result, optima=episodes.find_optima(task, optima, seed, folder, workers, robot, varied))
+        result = replace(result, optima=episodes.find_optima(task, optima, seed, workers, robot, varied))
     worst = _worst(result, policy, task, out / "worst", robot, varied)
     episodes.write(result, worst, facts, out)
     _print(result, worst)

@@ -9,6 +9,7 @@ which training chooses a policy is drawn for another purpose, and so shares no e
 """
 
 import itertools
+import json
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,19 +22,20 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
+from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, named_robot, robot_setting
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names
-from ballbot_train import jobs
+from ballbot_train.console import progress_bars
 from ballbot_train.evaluation.controllers import is_expert, make_controller
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
-from ballbot_train.executors import Workers
+from ballbot_train.executors import Workers, completed
 from ballbot_train.policy import PolicyController, PolicyNetwork
 
 with imports_of(__name__):
@@ -44,7 +46,6 @@ EPISODES = 10_000
 
 _MOST_EPISODES = 1_000_000
 _BATCH = 2500  # episodes that run at once
-_CHUNK = 5  # episodes of a job that finds optima
 _PURPOSES = {"evaluation": 0, "validation": 1, "training": 2}
 _DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
 _PER_BIN = 125  # episodes of a bin on average
@@ -360,50 +361,48 @@ def find_optima(
     task: str,
     episodes: int,
     seed: int,
-    out: Path,
     workers: int | Workers,
     robot: str = PAPER,
     randomization: Randomization = Randomization(),
 ) -> np.ndarray:
-    """(n,) optimal costs of the first fresh episodes of a seed, NaN where none was found.
+    """(n,) optimal costs of the first fresh episodes of a seed, NaN where none was found. They stay in the user's cache.
 
     Args:
         task: name of the task.
         episodes: how many.
         seed: of the episodes.
-        out: folder in which the optima stay, so that a later call finds only those that are missing.
         workers: a number of processes, or `Workers`.
         robot: by name.
         randomization: what the robot and the delay of each episode are drawn from.
     """
-    varied = {"randomization": repr(randomization)} if randomization.moves_optima else {}
-    jobs.claim(out, {"task": make_task(task, robot).problem(), "seed": seed, **robot_setting(robot), **varied})
-    try:
-        work = [
-            jobs.Job(f"optima-{start:06d}", _optima, (task, seed, robot, randomization), items, task)
-            for start in range(0, episodes, _CHUNK)
-            for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
-        ]
-        done = jobs.run(work, out, workers)
-    finally:
-        jobs.unlock(out)
-    return np.array([entry.get("cost", math.nan) for entries in done for entry in entries])
+    problem, params, costs = make_task(task, robot), named_robot(robot), np.full(episodes, np.nan)
+    starts = draw(problem, range(episodes), seed, robot=robot, randomization=randomization)
+    folder = cache.folder(problem, params, randomization) / f"fresh-{seed}"
+
+    def missing() -> Iterator[Any]:
+        for i, (x, c, drawn) in enumerate(zip(*starts, strict=True)):
+            path = folder / f"{i:06d}.json"
+            try:
+                costs[i] = files.read_json(path, kind=float)
+                advance(task, 1)
+            except files.FileError:
+                yield (i, path), _optimal_cost, (problem, params, x, c, randomization, tuple(drawn.tolist()))
+
+    with progress_bars({task: episodes}) as advance:
+        for (i, path), cost in completed(missing(), workers):
+            files.write(path, json.dumps(cost))
+            costs[i] = cost
+            advance(task, 1)
+    return costs
 
 
-def _optima(
-    task_name: str, seed: int, robot: str, randomization: Randomization, episodes: Sequence[int]
-) -> Iterator[jobs.Entry]:
+def _optimal_cost(*problem: Any) -> float:
     from ballbot_baselines.certification import optimum_of  # it imports CasADi
 
-    task = make_task(task_name, robot)
-    starts = draw(task, episodes, seed, robot=robot, randomization=randomization)
-    for i, x, c, drawn in zip(episodes, *starts, strict=True):
-        try:
-            optimum = optimum_of(task, named_robot(robot), x, c, randomization, tuple(drawn.tolist()))
-            entry = {"episode": i, "cost": optimum.cost}
-        except PlanError as error:
-            entry = {"episode": i, "error": str(error)}
-        yield entry
+    try:
+        return optimum_of(*problem).cost
+    except PlanError:
+        return math.nan
 
 
 def write(result: FreshResult, worst: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], out: Path) -> None:
