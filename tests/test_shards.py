@@ -12,13 +12,11 @@ import pytest
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
 from ballbot_gym.robots import ROBOTS, named_robot, robot_name
 from ballbot_train import shards
 from ballbot_train.commands.certify import certify
-from ballbot_train.learning.datasets import StreamedDemos, command_of, load_demos
+from ballbot_train.learning.datasets import command_of, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
-from ballbot_train.learning.learners import LEARNERS
 
 TASK = make_task("turn")
 CONFIG = DemoConfig("turn", "lqr", episodes=7, physics="rk4")
@@ -141,44 +139,6 @@ def test_demonstrations_of_a_robot_on_a_smoother_floor_are_those_of_the_robot_th
     write_shards(config, str(tmp_path / "set"), tmp_path / "out", 1)
     for robot in ("smoother", robot_name(smoother)):
         assert len(load_demos(tmp_path / "set", make_task("orbit", "smoother"), robot).actions) > 0
-
-
-def test_a_stream_gives_every_shard_once_per_epoch_in_an_order_of_its_own(demos):
-    def lengths(seed):
-        stream = StreamedDemos(demos / "set", TASK, seed)
-        return [len(stream.at(i)) for i in range(30)]
-
-    drawn = lengths(0)
-    assert len({tuple(sorted(drawn[i : i + 3])) for i in range(0, 30, 3)}) == 1
-    assert len({tuple(drawn[i : i + 3]) for i in range(0, 30, 3)}) > 1
-    assert drawn == lengths(0)
-    assert drawn != lengths(1)
-
-
-def test_behaviour_cloning_reads_one_shard_per_iteration_and_resumes_with_the_same_bits(demos, monkeypatch):
-    settings = type(LEARNERS["dagger"].settings("turn"))(
-        iterations=4, gathering_iterations=0, gradient_steps=2, batch_size=8, hidden=(4,)
-    )
-    read = []
-    real = shards.Shards.read
-    monkeypatch.setattr(shards.Shards, "read", lambda self, number: (read.append(number), real(self, number))[1])
-
-    def learner():
-        return LEARNERS["dagger"].make(TASK, default_params(), settings, 0, demos / "set")
-
-    first, second = learner(), learner()
-    for _ in range(4):
-        first.iterate()
-    assert len(read) == 4
-    assert set(read[:3]) == {0, 1, 2}
-    for _ in range(2):
-        second.iterate()
-    state, third = second.state_dict(), learner()
-    third.load_state_dict(state)
-    for _ in range(2):
-        third.iterate()
-    for a, b in zip(first.network.parameters(), third.network.parameters(), strict=True):
-        assert bool((a == b).all())
 
 
 def test_certified_shards_are_the_certified_set(tmp_path):

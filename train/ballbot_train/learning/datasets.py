@@ -1,4 +1,4 @@
-"""Reads demonstrations: a dataset as a whole, or shards one by one."""
+"""Reads demonstrations: Minari datasets, and sets of shards."""
 
 import itertools
 import shlex
@@ -28,8 +28,6 @@ IN_DATASET = {
     "truncations": "truncations",
 }
 """Where Minari keeps the arrays of an episode, by their names in a shard."""
-
-_UNFIT = (KeyError, ValueError, IndexError, TypeError)  # arrays that do not fit together
 
 
 @dataclass(frozen=True)
@@ -76,45 +74,6 @@ class Demos:
         return replace(self, rewards=rewards.astype(np.float32))
 
 
-class StreamedDemos:
-    """Demonstrations that are read shard by shard, for datasets that do not fit into memory."""
-
-    def __init__(self, url: str | Path, task: Task, seed: int = 0, robot: str = PAPER):
-        """Args: url: of a set of `ballbot demos --shards`; task, robot: as of `load_demos`; seed: of the order of shards.
-
-        Raises:
-            ValueError: there is no such set, or it is of another task, robot or observation version.
-        """
-        self._shards, self._task, self._seed = shards.Shards(url), task, seed
-        if self._shards.about is None or "demos" not in self._shards.about or not self._shards.numbers:
-            raise ValueError(f'{url} is no dataset of "ballbot demos --shards", or an empty one')
-        _check_made_for(str(url), self._shards.about, task, robot)
-
-    def at(self, iteration: int) -> Demos:
-        """The demonstrations of an iteration: one shard, which depends on seed and iteration alone.
-
-        All shards come once before any comes again, each time in another order.
-        """
-        numbers = self._shards.numbers
-        epoch, i = divmod(iteration, len(numbers))
-        order = np.random.default_rng([self._seed, epoch, 2]).permutation(len(numbers))
-        return self._read(numbers[order[i]])
-
-    def all(self) -> Demos:
-        """The demonstrations of all shards."""
-        parts = [vars(self._read(number)) for number in self._shards.numbers]
-        return Demos(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-
-    def _read(self, number: int) -> Demos:
-        arrays = self._shards.read(number)
-        try:
-            return _demos(arrays, len(self._task.observation_scale))
-        except _UNFIT as error:
-            raise ValueError(
-                f"shard {number} of {self._shards.url} is damaged; make the set anew ({error!r:.300})"
-            ) from error
-
-
 def load_demos(path: str | Path, task: Task, robot: str = PAPER) -> Demos:
     """Reads a dataset of `ballbot demos`, all its episodes.
 
@@ -126,12 +85,10 @@ def load_demos(path: str | Path, task: Task, robot: str = PAPER) -> Demos:
     Raises:
         ValueError: there is no such dataset, or it is damaged, or of another task, robot or observation version.
     """
-    if shards.is_set(path):
-        return StreamedDemos(path, task, robot=robot).all()
-    path = Path(path)
     _check_made_for(str(path), metadata_of(path), task, robot)
     try:
-        return _demos(_dataset(path), len(task.observation_scale))
+        arrays = _sharded(path) if shards.is_set(path) else _dataset(Path(path))
+        return _demos(arrays, len(task.observation_scale))
     except Exception as error:  # h5py has dozens of ways to refuse a damaged file
         raise ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})') from error
 
@@ -149,6 +106,12 @@ def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task, robot: s
             f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "
             'make it anew with "ballbot demos"'
         )
+
+
+def _sharded(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of all shards of a set as those of one."""
+    parts = [arrays for arrays in shards.Shards(path) if arrays]  # without a plan there is no array
+    return {name: np.concatenate([part[name] for part in parts]) for name in (*IN_DATASET, "lengths")}
 
 
 def _dataset(path: Path) -> dict[str, np.ndarray]:
@@ -205,20 +168,20 @@ def command_of(path: str | Path) -> str:
     Raises:
         ValueError: it is no such dataset.
     """
+    settings, options = metadata_of(path)["demos"], {"out": str(path)}
     if shards.is_set(path):
-        opened = shards.Shards(path)
-        settings = {"episodes": opened.episodes} | (opened.about or {}).get("demos", {})
-        options = {"shards": str(path)}
-    else:
-        settings, options = metadata_of(Path(path))["demos"], {"out": str(path)}
+        settings, options = {"episodes": shards.Shards(path).episodes} | settings, {"shards": str(path)}
     words = ["ballbot", "demos", *itertools.chain(*itertools.starmap(option, (settings | options).items()))]
     return shlex.join(words)
 
 
-def metadata_of(path: Path) -> dict[str, Any]:
+def metadata_of(path: str | Path) -> dict[str, Any]:
     """Metadata of a dataset of `ballbot demos`; raises a ValueError for anything else."""
     try:
-        metadata = files.read_json(path / "data" / "metadata.json")
+        if shards.is_set(path):
+            metadata = shards.Shards(path).about or {}
+        else:
+            metadata = files.read_json(Path(path) / "data" / "metadata.json")
         if not isinstance(metadata.get("demos"), dict):
             raise ValueError("not made by ballbot demos")
     except ValueError as error:

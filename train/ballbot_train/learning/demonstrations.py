@@ -13,8 +13,7 @@ dataset shows recoveries too.
 
 `plans` counts the expert's plans, and `plans_failed` its searches that found none.
 
-`load_demos` reads a dataset for learners. Datasets of any size are shards: `write_shards` makes them, and `StreamedDemos`
-reads them one by one.
+`load_demos` reads a dataset for learners. `write_shards` makes shards in place of a dataset.
 """
 
 import importlib.metadata
@@ -245,7 +244,7 @@ def write_shards(
     workers: int | Workers,
     per_shard: int = shards.EPISODES,
 ) -> shards.Shards:
-    """Makes a dataset of any size as shards, which `load_demos` and `StreamedDemos` read. A killed run continues.
+    """Makes a dataset of any size as shards, which `load_demos` reads. A killed run continues.
 
     Args:
         config: settings of the dataset. Its number of episodes may grow later.

@@ -35,11 +35,10 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, actor_for
-from ballbot_train.learning.datasets import StreamedDemos, load_demos
+from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
-from ballbot_train.shards import is_set
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ class Dagger:
     ):
         """As of `Algorithm.make`. Demonstrations are its first samples."""
         on_track, robot = randomization is not None or history > 0, robot_name(params)
-        samples = _first_samples(demos, task, robot, config, seed, on_track)
+        samples = _first_samples(demos, task, robot, config, on_track)
         self.config, self.iteration, self._warm = config, 0, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
@@ -122,18 +121,14 @@ class Dagger:
         self.network = actor_for(task, params, config, history, False, start)
         self._fit = Fit(self.network)
         none = np.zeros((0, self.network.spec.seen))
-        self._streamed = samples if isinstance(samples, StreamedDemos) else None
-        self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, params.action_size)))
+        self._samples = Samples.of(none, np.zeros((0, params.action_size))) if samples is None else samples
 
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes
         if routes is not None and self.iteration == 0 and not self._warm:
             fit_routes(routes, self._task, self._params, self._seed)
         rng = np.random.default_rng([self._seed, self.iteration])
-        if self._streamed is not None:  # one shard after the other is in memory
-            demos = self._streamed.at(self.iteration)
-            self._samples = Samples.of(demos.observations, demos.actions)
-        elif self.iteration < config.gathering_iterations or not len(self._samples):
+        if self.iteration < config.gathering_iterations or not len(self._samples):
             figures = self._gather(rng)
         progress = self.iteration / config.iterations
         rate = schedules.cosine(config.learning_rate, _FINAL_LEARNING_RATE_FRACTION, progress)
@@ -142,10 +137,9 @@ class Dagger:
         return {"loss/imitation": loss, "train/learning_rate": rate, "train/samples": len(self._samples), **figures}
 
     def state_dict(self) -> dict[str, Any]:
-        samples = self._samples if self._streamed is None else Samples.of(np.zeros((0, 1)), np.zeros((0, 2)))
         return {
             "iteration": self.iteration,
-            "samples": [samples.observations, samples.actions, samples.weights],
+            "samples": [self._samples.observations, self._samples.actions, self._samples.weights],
             **self._fit.state_dict(),
         }
 
@@ -341,8 +335,8 @@ def _find_alone(
 
 
 def _first_samples(
-    demos: str | Path | None, task: Task, robot: str, config: DaggerConfig, seed: int, on_track: bool
-) -> Samples | StreamedDemos | None:
+    demos: str | Path | None, task: Task, robot: str, config: DaggerConfig, on_track: bool
+) -> Samples | None:
     """Demonstrations, if there are any; raises a ValueError where they do not fit."""
     if demos is None:
         if config.gathering_iterations:
@@ -352,10 +346,6 @@ def _first_samples(
         raise ValueError(
             "demonstrations show no past and no track; leave out --demos, or --randomization and --history"
         )
-    if is_set(demos):
-        if config.gathering_iterations:
-            raise ValueError(f"{demos} is a set of shards, which dagger only clones: give --gathering-iterations 0")
-        return StreamedDemos(demos, task, seed, robot)
     loaded = load_demos(demos, task, robot)
     weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
     return Samples.of(loaded.observations, loaded.actions, weights)
