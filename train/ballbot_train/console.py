@@ -6,6 +6,7 @@ escape HTML, `files.write_csv` what a spreadsheet takes for a formula.
 
 import sys
 import threading
+import time
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -88,23 +89,12 @@ def _speed(task: Task) -> str:
 class LineProgress(Progress):
     """Progress for a file or a pipe, which cannot show a bar: every now and then a line per bar that is not full."""
 
-    def __init__(self, *columns: Any, **keywords: Any):
-        super().__init__(*columns, **keywords)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._print_lines, daemon=True)
-
     def start(self) -> None:
         super().start()
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._ended.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        super().stop()
+        threading.Thread(target=self._print_lines, daemon=True).start()
 
     def _print_lines(self) -> None:
-        while not self._ended.wait(LINE_SECONDS):
+        while not time.sleep(LINE_SECONDS) and self.live.is_started:
             for task in self.tasks:
                 if not task.finished:
                     elapsed = timedelta(seconds=int(task.elapsed or 0))

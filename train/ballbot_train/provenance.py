@@ -34,16 +34,11 @@ def commit_of(file: Path) -> str:
     "none" where no folder above it is a checkout, where the checkout does not track it (an installed package in somebody
     else's repository), and where git is missing.
     """
-    file = file.resolve()
-    if not any((folder / ".git").exists() for folder in file.parents):
-        return "none"
-    try:
-        _git(file.parent, "ls-files", "--error-unmatch", file.name)
-        return _git(file.parent, "describe", "--always", "--dirty") or "none"
-    except (OSError, subprocess.SubprocessError):
-        return "none"
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(folder), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
+    said = ""
+    for command in (["ls-files", "--error-unmatch", file.name], ["describe", "--always", "--dirty"]):
+        try:
+            words = ["git", "-C", str(file.resolve().parent), *command]
+            said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            return "none"
+    return said or "none"

@@ -1,6 +1,7 @@
 """Every controller of every task on the certified episodes, in parallel processes and resumably."""
 
 import base64
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import VARIANTS
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
@@ -58,14 +58,9 @@ def controllers_by_robot(
     if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
     chosen: dict[str, dict[str, list[str]]] = {}
-    for robot, by_task in known.items():
-        behind = ("", *registry.filters(named_robot(robot)))
-        for task, group in by_task.items():
-            by_task[task] = [*VARIANTS, *(name + each for name in group for each in behind)]
-            problem, given = make_task(task, robot), filter(registry.is_file, names)
-            made = [*by_task[task], *(name for name in given if registry.is_made_for(name, problem, robot))]
-            if found := [name for name in names if name in made]:
-                chosen.setdefault(robot, {})[task] = found
+    for robot, task in itertools.product(robots, tasks):
+        if found := [name for name in names if registry.acts_in(name, make_task(task, robot), robot)]:
+            chosen.setdefault(robot, {})[task] = found
     used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
     unused = [name for name in names if name not in used]
     if unused and registry.is_file(unused[0]):

@@ -50,6 +50,15 @@ def is_saved_model(name: str) -> bool:
     return Path(plain(name)).suffix == ".zip"
 
 
+def acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
+    """Whether a task has a controller of that name for a robot; of a file as of `is_made_for`."""
+    if is_file(name):
+        return is_made_for(name, task, robot)
+    ending = _filter_of(name)
+    behind = not ending or ending in filters(named_robot(robot))
+    return name in VARIANTS or (behind and name.removesuffix(ending) in names(task, robot, None))
+
+
 def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
     """Whether the policy of a file is one for a task and a robot. A saved model tells only its spaces.
 

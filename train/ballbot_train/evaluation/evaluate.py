@@ -21,7 +21,7 @@ from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import make_controller, policy_digest
-from ballbot_train.evaluation.results import UNMEASURED, Result, Row, summarize, write_leaderboard
+from ballbot_train.evaluation.results import Result, Row, summarize, write_leaderboard
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.provenance import provenance
@@ -201,7 +201,7 @@ def run_episodes(
         try:
             run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=known.options(i))
         except PlanError as error:
-            measures: dict[str, Any] = UNMEASURED | {"cost": env.task.survival_pay, "note": str(error)}
+            measures: dict[str, Any] = {"cost": env.task.survival_pay, "note": str(error)}
             measures |= {"success": False, "failure": True}
         else:
             measures = {

@@ -16,7 +16,7 @@ from ballbot_train.evaluation.statistics import interval
 
 @dataclass(frozen=True)
 class Result:
-    """One certified episode under one controller; SI units, angles in degrees."""
+    """One certified episode under one controller; SI units, angles in degrees. Without a trajectory measures are NaN."""
 
     task: str
     controller: str
@@ -26,11 +26,11 @@ class Result:
     optimum: float
     success: bool
     failure: bool
-    peak_tilt: float
-    settle_time: float
-    duration: float
-    plan_seconds: float
-    step_seconds: float
+    peak_tilt: float = math.nan
+    settle_time: float = math.nan
+    duration: float = math.nan
+    plan_seconds: float = math.nan
+    step_seconds: float = math.nan
     effort: float = math.nan
     """Mean of |F| over the episode, N."""
     note: str = ""
@@ -42,10 +42,6 @@ class Result:
     def regret(self) -> float:
         """cost / optimum − 1; NaN for a failed episode, whose cost is a price and not a performance."""
         return math.nan if self.failure else self.cost / self.optimum - 1
-
-
-UNMEASURED = dict.fromkeys(("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan)
-"""What a Result says of an episode that has no trajectory."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -25,7 +25,7 @@ from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_train.evaluation import recordings
-from ballbot_train.evaluation.results import UNMEASURED, Result, read_results, summarize, to_json
+from ballbot_train.evaluation.results import Result, read_results, summarize, to_json
 
 TOLERANCE = 1e-6
 """Largest difference of a recorded state from the one that follows, m, rad and per second, where the state is all that
@@ -96,7 +96,6 @@ class Entry:
                 optimum=float(optima[i]),
                 success=end == _SUCCESS,
                 failure=end not in (_SUCCESS, _MISSED),
-                **UNMEASURED,
             )
             for i, (cost, end) in enumerate(zip(self.costs, self.ends, strict=True))
         ]
