@@ -191,7 +191,7 @@ class BallbotBatch:
         self._compile = compile
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
         wheels = self.params.wheels is not None
-        self._run = _compiled(self._compilable) if wanted and not wheels else self.transition
+        self._run = _compiled(self._transition) if wanted and not wheels else self._transition
         self._slope = self._compiled_slope() if wanted and wheels and not self.randomization.varies_robot else None
         self._proven = not wanted
 
@@ -206,13 +206,13 @@ class BallbotBatch:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._run = _compiled(self._compilable) if state["_run"] else self.transition
+        self._run = _compiled(self._transition) if state["_run"] else self._transition
         self._slope = self._compiled_slope() if state["_slope"] else None
 
     @property
     def compiled(self) -> bool:
         """Whether `step` runs compiled code. It can change once, at the first step, where compiling fails."""
-        return self._run != self.transition
+        return self._run != self._transition
 
     def reset(
         self,
@@ -325,13 +325,10 @@ class BallbotBatch:
                 raise
             reason = str(error).strip().splitlines()[:1]
             _log.warning("torch.compile failed, the batch runs eagerly: %s %s", type(error).__name__, reason)
-            self._run, self._slope = self.transition, None
+            self._run, self._slope = self._transition, None
             self.state, result = self._run(state, actions)
         self._proven = True
-        if self.compiled:
-            flags = {name: getattr(result, name).bool() for name in _FLAGS}
-            result = result._replace(violated=result.violated.long(), **flags)
-        return result
+        return _typed(result)
 
     def detach(self) -> None:
         """Cuts the gradient: gradients of later steps do not flow into earlier ones."""
@@ -347,10 +344,10 @@ class BallbotBatch:
                 checked.
         """
         state, result = self._transition(state, actions)
-        return state, result._replace(violated=result.violated.long())
+        return state, _typed(result)
 
     def _transition(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
-        """`transition` with `violated` as a number of the batch's dtype."""
+        """`transition` with flags, 0 and 1, and `violated` as numbers: torch's CPU code generator stores bools one by one."""
         task, noise = self.task, self.randomization
         now = _rows(state)
         x, c = now.x, now.c
@@ -375,10 +372,10 @@ class BallbotBatch:
                 grip = torch.stack((*at_begin, needed))
         steps = state.steps + 1
         did = outcome(task, x, force, end, c, steps.to(self.dtype), kept)
-        terminated, truncated, success, failure = (part > 0 for part in did[3:7])
+        truncated = did.truncated
         if self.most_steps < task.steps:
-            truncated = truncated | (~terminated & (steps >= self.most_steps))
-        done = terminated | truncated
+            truncated = torch.where(steps >= self.most_steps, 1.0 - did.terminated, truncated)
+        done = did.terminated + truncated > 0
         reward = task.survival_reward * task.control_dt - did.running + did.goal
 
         past = now.past
@@ -400,15 +397,15 @@ class BallbotBatch:
             observation=observation,
             reward=reward,
             cost=did.cost,
-            terminated=terminated,
+            terminated=did.terminated,
             truncated=truncated,
             final_observation=observed,
             final_x=torch.stack(end),
-            success=success,
-            failure=failure,
+            success=did.success,
+            failure=did.failure,
             violated=did.violated,
             force=torch.stack(force),
-            clipped=any_of(part.abs() > 1.0 for part in asked),
+            clipped=torch.where(any_of(part.abs() > 1.0 for part in asked), 1.0, 0.0),
             final_tilt=tilt_of(end),
             tilt=tilt_of(new.x),
             grip=grip,
@@ -434,12 +431,6 @@ class BallbotBatch:
             return torch.stack(dynamics.derivative(params, x.unbind(0), u.unbind(0)))
 
         return torch.compile(slope, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
-
-    def _compilable(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
-        """`transition` with its flags as numbers 0 and 1: torch's CPU code generator stores bools one by one."""
-        state, result = self._transition(state, actions)
-        numbers = {name: torch.where(getattr(result, name), 1.0, 0.0) for name in _FLAGS}
-        return state, result._replace(**numbers)
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
@@ -508,6 +499,12 @@ class BallbotBatch:
         return BatchState(
             *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
         )
+
+
+def _typed(result: BatchStep) -> BatchStep:
+    """A step whose flags and `violated` are numbers, with bools and an int64."""
+    flags = {name: getattr(result, name) > 0 for name in _FLAGS}
+    return result._replace(violated=result.violated.long(), **flags)
 
 
 def _has_compiler(device: torch.device) -> bool:

@@ -24,12 +24,8 @@ class BatchEpisodes(NamedTuple):
     """(B,) bool: the episode ended at a violated limit."""
     violated: torch.Tensor
     """(B,) int64 index in the batch's `limit_names` of the limit at which the episode ended, else −1."""
-    terminated: torch.Tensor
-    """(B,) bool: the episode ended by success or failure, not because its time was over."""
     steps: torch.Tensor
     """(B,) int64, control steps taken."""
-    states: torch.Tensor | None
-    """(T, 8, B) states after each control step, where they were recorded. What follows the end of an episode is undefined."""
 
 
 @torch.no_grad()
@@ -38,19 +34,15 @@ def run_episodes(
     policy: Callable[[torch.Tensor], torch.Tensor],
     x: np.ndarray | torch.Tensor,
     c: np.ndarray | torch.Tensor,
-    record: bool = False,
     drawn: np.ndarray | None = None,
 ) -> BatchEpisodes:
-    """Runs one episode of each environment, all at once and without gradients.
-
-    It stops when the last episode has ended, unless states are recorded.
+    """Runs one episode of each environment, all at once and without gradients, until the last one has ended.
 
     Args:
         batch: where to run; it is reset with seed 0.
         policy: from observations (B, no) to actions (B, 2).
         x: (B, 8) initial states.
         c: (B, nc) constants of the episodes.
-        record: whether to keep the states of all control steps.
         drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
     given = (
@@ -59,24 +51,18 @@ def run_episodes(
     )
     observation = batch.reset(0, None, *given)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
-    success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
+    success = torch.zeros_like(running)
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
     steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
     violated = torch.full_like(steps, -1)
-    states: list[torch.Tensor] = []
     for _ in range(batch.task.steps):
         result = batch.step(policy(observation))
         observation = result.observation
         cost += torch.where(running, result.cost, 0.0)
         steps += running
         success |= running & result.success
-        failure |= running & result.failure
         violated = torch.where(running & result.failure, result.violated, violated)
-        terminated |= running & result.terminated
         running &= ~(result.terminated | result.truncated)
-        if record:
-            states.append(result.final_x)
-        elif not running.any():
+        if not running.any():
             break
-    recorded = torch.stack(states) if record else None
-    return BatchEpisodes(cost, success, failure, violated, terminated, steps, recorded)
+    return BatchEpisodes(cost, success, violated >= 0, violated, steps)
