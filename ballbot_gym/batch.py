@@ -126,7 +126,7 @@ class BallbotBatch:
     """B ballbots that do one task, in torch, differentiable from actions and states to rewards, costs and observations.
 
     `transition` is a pure function of state and actions; `reset` and `step` apply it to `self.state`. Gradients flow
-    through `step` into earlier actions until an episode ends; `detach` cuts them. The physics is the closed form of
+    through `step` into earlier actions until an episode ends. The physics is the closed form of
     `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to go on from there. Copies and
     pickles are independent batches in the same state.
 
@@ -251,7 +251,9 @@ class BallbotBatch:
         drawn: torch.Tensor | None = None,
     ) -> BatchState:
         """The state in which `reset` with these arguments would start; changes nothing."""
-        self._check_mask(mask)
+        size = self.num_envs
+        if mask is not None and (not isinstance(mask, torch.Tensor) or (mask.dtype, *mask.shape) != (torch.bool, size)):
+            raise ValueError(f"mask must be a tensor of {size} bools, not {_described(mask)}")
         self._check_given(x, self.params.state_size, "x")
         self._check_given(drawn, self.randomization.episode_draws * self.randomization.varies_episodes, "drawn")
         if c is not None:
@@ -271,21 +273,8 @@ class BallbotBatch:
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c, drawn)
         if x is not None:
-            begin = self.task.at(new.c, torch.zeros_like(new.x[0]))
-            violated = first_violated(self.task.limits(new.x, begin))
-            bad = (mask & (violated >= 0)).nonzero()[:, 0].tolist()
-            if bad:
-                raise ValueError(
-                    f"start states of envs {bad[:8]} violate limits of {self.task.id}: that of env {bad[0]} the limit of "
-                    f"{self.task.limit_names[int(violated[bad[0]])]}"
-                )
+            check_starts(self.task, new.x, new.c, mask)
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
-
-    def _check_mask(self, mask: Any) -> None:
-        if mask is None:
-            return
-        if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_envs,):
-            raise ValueError(f"mask must be a tensor of {self.num_envs} bools, not {_described(mask)}")
 
     def _check_tensor(self, given: Any, shape: tuple[int, ...], what: str) -> None:
         if not isinstance(given, torch.Tensor) or given.shape != shape:
@@ -329,11 +318,6 @@ class BallbotBatch:
             self.state, result = self._run(state, actions)
         self._proven = True
         return _typed(result)
-
-    def detach(self) -> None:
-        """Cuts the gradient: gradients of later steps do not flow into earlier ones."""
-        if self.state is not None:
-            self.state = BatchState(*(part.detach() for part in self.state))
 
     def transition(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
         """One control step of every env, and the start of the next episode where one ended; a pure function.
@@ -431,14 +415,6 @@ class BallbotBatch:
             return torch.stack(dynamics.derivative(params, x.unbind(0), u.unbind(0)))
 
         return torch.compile(slope, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
-
-    def robot(self, i: int) -> BallbotParams:
-        """The robot of env i in its running episode."""
-        if self.state is None:
-            raise gymnasium.error.ResetNeeded("no episode before reset()")
-        if not self.randomization.varies_robot:
-            return self.params
-        return self.randomization.robot(self.params, tuple(self.state.drawn[:, i].tolist()))
 
     def model(self, drawn: tuple[torch.Tensor, ...]) -> BallbotParams:
         """The robots for whose episodes the randomization drew this, (B,) each, as one whose numbers are (B,)."""
@@ -539,6 +515,17 @@ def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
         return a if a is b else torch.where(mask, a, b)
 
     return BatchState(*map(chosen, new, old))
+
+
+def check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:
+    """Raises a ValueError if states in 8 rows (B,) violate a limit of the task where the mask holds."""
+    violated = first_violated(task.limits(x, task.at(c, 0 * x[0])))
+    bad = [i for i, is_bad in enumerate((mask & (violated >= 0)).tolist()) if is_bad]
+    if bad:
+        raise ValueError(
+            f"start states of envs {bad[:8]} violate limits of {task.id}: that of env {bad[0]} the limit of "
+            f"{task.limit_names[int(violated[bad[0]])]}"
+        )
 
 
 def any_of(conditions: Any) -> torch.Tensor:

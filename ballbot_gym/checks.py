@@ -116,14 +116,9 @@ def check_history(history: Any) -> int:
 def check_constant_names(task: Any, named: dict[str, Any]) -> None:
     """Raises a ValueError that says which constants a task has, where others are given by name."""
     unknown = sorted(set(named) - set(task.constant_names), key=repr)
-    if not unknown:
-        return
-    if not task.constant_names:
-        raise ValueError(
-            f'{task.id} has no constants {unknown}; its episodes have none: leave options["constants"] out, or set '
-            'the start with options={"state": x}'
-        )
-    raise ValueError(f"{task.id} has no constants {unknown}; it has {list(task.constant_names)}")
+    if unknown:
+        known = list(task.constant_names) or 'none: leave options["constants"] out'
+        raise ValueError(f"{task.id} has no constants {unknown}; it has {known}")
 
 
 _Kind = TypeVar("_Kind", bound=type)

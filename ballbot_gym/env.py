@@ -353,12 +353,10 @@ class BallbotEnv(gymnasium.Env):
             raise TypeError(f"set_state() takes what get_state() returned, not {type(state).__name__}")
         if state.task != self.task:
             raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
-        if bool(state.drawn) != self.randomization.active:
-            raise ValueError("the state is of an env with other randomization")
-        if len(state.past) != (sum(self.observation_space.shape or ()) if self.history else 0):
-            raise ValueError("the state is of an env with another history")
-        if bool(state.sensors) != (self.observation == "sensors"):
-            raise ValueError("the state is of an env with another observation")
+        observed = len(state.past), bool(state.sensors)
+        size = sum(self.observation_space.shape or ()) if self.history else 0
+        if (bool(state.drawn), *observed) != (self.randomization.active, size, self.observation == "sensors"):
+            raise ValueError("the state is of an env with another randomization, history or observation")
         self._drawn, self._actuator, self._sensors = state.drawn, state.actuator, state.sensors
         self._past = np.array(state.past, np.float32)
         self._set_constants(state.constants)

@@ -20,6 +20,7 @@ from ballbot_gym import codegen, machine_code
 from ballbot_gym.autoreset import Info, VectorStep, info_of, step
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
+from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.seeding import seeds_of
@@ -31,10 +32,6 @@ import torch  # after our modules, whose errors name the extra that brings it
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
 """Number of envs from which threads share the work: 2,048 take as long on two as on one, and 4,096 a seventh less."""
-
-
-class NativeUnavailableError(RuntimeError):
-    """There is no machine code for a task; the message says why."""
 
 
 State = Any
@@ -68,7 +65,7 @@ class BallbotNative:
             code: the library of `codegen`'s functions; default, those of the task and the robot, once they were checked.
 
         Raises:
-            NativeUnavailableError: CasADi or a C compiler is missing, or the task cannot be traced.
+            NoMachineCodeError: CasADi or a C compiler is missing, or the task cannot be traced.
             ValueError: num_envs out of range.
         """
         self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
@@ -201,12 +198,6 @@ class BallbotNative:
         did = pay[0], pay[1:], force, success, failure, clipped, told[grip : self._told_rows]
         return info_of(state, told[tilt], violated, *did)
 
-    def robot(self, i: int) -> BallbotParams:
-        """The robot of env i in its running episode."""
-        if self.state is None:
-            raise gymnasium.error.ResetNeeded("no episode before reset()")
-        return self.params
-
     def _unstarted(self) -> State:
         """A state before the first episodes, with random seeds."""
         size = self.num_envs
@@ -267,7 +258,7 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDL
     A symbol that is made a float, for one, becomes NaN without a word.
 
     Raises:
-        NativeUnavailableError: see `BallbotNative`.
+        NoMachineCodeError: see `BallbotNative`.
     """
     code, dtype = _code(task, params, double), np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
@@ -283,7 +274,7 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDL
         values |= done._asdict() | done.now | {f"final {k}": part for k, part in done.end.items()}
     for name in expected.keys() - {"now", "end"}:
         if not np.allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
-            raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
+            raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
     return code
 
 
@@ -292,16 +283,16 @@ def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
     """The library of a task and a robot.
 
     Raises:
-        NativeUnavailableError: see `BallbotNative`.
+        NoMachineCodeError: see `BallbotNative`.
     """
     try:
         source = codegen.source(task, params, double)
     except Exception as error:  # whatever code of users raises that meets CasADi's symbols
-        raise NativeUnavailableError(f"{task.id} cannot be traced: {type(error).__name__}: {error}") from error
+        raise NoMachineCodeError(f"{task.id} cannot be traced: {type(error).__name__}: {error}") from error
     try:
         library = ctypes.CDLL(str(machine_code.library(type(task).__name__.lower(), source, _COMPILER_FLAGS)))
-    except (OSError, machine_code.NoMachineCodeError) as error:
-        raise NativeUnavailableError(str(error) or "there is no C compiler that works") from error
+    except (OSError, NoMachineCodeError) as error:
+        raise NoMachineCodeError(str(error) or "there is no C compiler that works") from error
     count, pointer = ctypes.c_int64, ctypes.c_void_p
     memory = ctypes.POINTER(_Memory)
     signatures = {

@@ -20,9 +20,9 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
-from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import install
+from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization
@@ -41,7 +41,7 @@ except ImportError as error:
     ) from error
 
 from ballbot_gym.autoreset import Info, as_array, filled, info_of, step
-from ballbot_gym.batch import BallbotBatch, BatchState, dtype_named, tilt_of
+from ballbot_gym.batch import BallbotBatch, BatchState, check_starts, dtype_named, tilt_of
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
@@ -107,7 +107,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             render_mode: None or "rgb_array", which draws every env in turn.
-            autoreset_mode: an `AutoresetMode`, or its value or name; default, SAME_STEP.
+            autoreset_mode: an `AutoresetMode`, or its value; default, SAME_STEP.
             physics: "rk4". Gymnasium's own vector envs run the others.
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
@@ -129,8 +129,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self._spec: EnvSpec | None = None
         params = checked_robot(robot, params)
         task = make_task(task, params, **task_fields)
-        _check_physics(physics, task, num_envs)
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        if physics != "rk4":
+            raise ValueError(
+                f'these vector environments run physics="rk4", not {physics!r}; for "bullet" or "mujoco": '
+                f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics=...), or "async"'
+            )
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         if engine == "native" and torch.device(device).type != "cpu":
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
@@ -141,8 +145,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 task, num_envs, device, real, compile, params, randomization, history=history, observation=observation
             )
 
-        native = None
-        if engine == "native" or (engine == "auto" and torch.device(device).type == "cpu" and compile == "auto"):
+        native, cpu = None, torch.device(device).type == "cpu"
+        if engine == "native" or (engine == "auto" and cpu and compile == "auto"):
             # the batch is made in any case, because it checks the arguments; it allocates nothing
             native = _native(batch(compile=False), self._dtype, must=engine == "native")
         self.batch: BallbotBatch | BallbotNative = native or batch(compile)
@@ -259,7 +263,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if name == "np_random_seed":
             return self.np_random_seed
         if name == "episode_params":
-            return tuple(self.batch.robot(i) for i in range(self.num_envs))
+            varied, drawn = self.randomization.varies_robot, as_array(self._state.drawn).T.tolist()
+            return tuple(self.randomization.robot(self.params, tuple(row)) if varied else self.params for row in drawn)
         return (getattr(self, name),) * self.num_envs
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -280,9 +285,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     @property
     def np_random_seed(self) -> tuple[int, ...]:
         """The seed of each env; its episodes are a function of it and of their number."""
-        if self.batch.state is None:
-            raise gymnasium.error.ResetNeeded("no seeds before reset()")
-        return tuple(self.batch.state.seed.tolist())
+        return tuple(self._state.seed.tolist())
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """An image (height, width, 3), uint8, of each env."""
@@ -290,9 +293,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the envs with render_mode="rgb_array"')
             return None
-        if self.batch.state is None:
-            raise gymnasium.error.ResetNeeded("render() before reset()")
-        states, constants = (np.array(part.T.tolist()) for part in (self.batch.state.x, self.batch.state.c))
+        states, constants = (np.array(part.T.tolist()) for part in (self._state.x, self._state.c))
         return tuple(
             picture(Drawing(self.params, (Robot(x),), markers=tuple(self.task.markers(c))))
             for x, c in zip(states, constants, strict=True)
@@ -305,9 +306,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ResetNeeded: before `reset`.
         """
         self._check_open()
-        if self.batch.state is None:
-            raise gymnasium.error.ResetNeeded("get_state() before reset()")
-        return VectorState(self.task, self.batch.state, self._ended)
+        return VectorState(self.task, self._state, self._ended)
 
     def set_state(self, state: VectorState) -> None:
         """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
@@ -325,6 +324,13 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
+
+    @property
+    def _state(self) -> BatchState:
+        """What the batch remembers, once there is something."""
+        if self.batch.state is None:
+            raise gymnasium.error.ResetNeeded("no state before reset()")
+        return self.batch.state
 
     def _to_batch(self, array: np.ndarray) -> Any:
         """The array as the batch takes it."""
@@ -349,10 +355,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         drawn, c = as_array(state.x), as_array(state.c)
         wanted = finite_array(given, (self.num_envs, self.params.state_size), "state", broadcast=True).T
         x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
-        safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), self.task.at(tuple(c), 0.0))], axis=0)
-        if not safe[mask].all():
-            bad = np.flatnonzero(mask & ~safe)
-            raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")
+        check_starts(self.task, tuple(x), tuple(c), mask)
         return state._replace(x=self._to_batch(x))
 
 
@@ -368,14 +371,10 @@ def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "Ballb
             raise ValueError('engine="native" knows no Randomization, no history and no sensors; take engine="torch"')
         return None
     try:
-        from ballbot_gym.native import BallbotNative, NativeUnavailableError
-    except ImportError:
-        if must:
-            raise
-        return None
-    try:
+        from ballbot_gym.native import BallbotNative
+
         return BallbotNative(batch.task, batch.num_envs, dtype, batch.params, torch.get_num_threads())
-    except NativeUnavailableError as error:
+    except (ImportError, NoMachineCodeError) as error:
         if must:
             raise
         _log.warning("no machine code, so the envs are slower: %s", error)
@@ -389,28 +388,6 @@ def _most_steps(max_episode_steps: int | None, task: Task) -> int:
     if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int) or max_episode_steps < 1:
         raise ValueError(f"max_episode_steps must be a positive whole number, not {max_episode_steps!r}")
     return min(max_episode_steps, task.steps)
-
-
-def _check_physics(physics: str, task: Task, num_envs: int) -> None:
-    """Raises a ValueError that says how to get other physics than the closed form."""
-    if physics not in PHYSICS:
-        raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
-    if physics != "rk4":
-        raise ValueError(
-            f'these vector environments run physics="rk4"; for {PHYSICS_NAMES[physics]}: '
-            f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics="{physics}")'
-            ', or "async"'
-        )
-
-
-def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """The mode of that value or name."""
-    for known in AutoresetMode:
-        if mode in (known, known.value, known.name):
-            return known
-    raise ValueError(
-        f"unknown autoreset_mode {mode!r}; known: {', '.join(repr(known.value) for known in AutoresetMode)}"
-    )
 
 
 def _reset_mask(mask: Any, num_envs: int) -> np.ndarray:

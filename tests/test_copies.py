@@ -89,7 +89,7 @@ def test_bad_states_are_refused():
     assert isinstance(state, EnvState)
     with pytest.raises(ValueError, match="the state is of Stabilize"):
         BallbotEnv("turn", physics="rk4").set_state(state)
-    with pytest.raises(ValueError, match="other randomization"):
+    with pytest.raises(ValueError, match="another randomization"):
         BallbotEnv(physics="rk4", randomization=ALL).set_state(state)
     with pytest.raises(TypeError, match="takes what get_state"):
         env.set_state(np.zeros(8))

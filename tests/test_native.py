@@ -207,7 +207,7 @@ def test_a_task_that_cannot_be_traced_runs_in_torch_with_a_word_in_the_log(caplo
         assert isinstance(BallbotVectorEnv(100, Branching()).batch, BallbotBatch)
     assert len(caplog.records) == 1
     assert f"no machine code, so the envs are slower: {reason}" in caplog.text
-    with pytest.raises(native.NativeUnavailableError, match=reason):
+    with pytest.raises(machine_code.NoMachineCodeError, match=reason):
         BallbotVectorEnv(100, Branching(), engine="native")
 
 
@@ -220,7 +220,7 @@ def test_without_a_compiler_envs_run_in_torch(monkeypatch, caplog):
     with caplog.at_level(logging.WARNING):
         assert isinstance(BallbotVectorEnv(2).batch, BallbotBatch)
     assert "no such instruction" in caplog.text
-    with pytest.raises(native.NativeUnavailableError, match="no such instruction"):
+    with pytest.raises(machine_code.NoMachineCodeError, match="no such instruction"):
         BallbotVectorEnv(2, engine="native")
     native._code.cache_clear(), native._checked_code.cache_clear()
 

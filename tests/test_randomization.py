@@ -233,7 +233,7 @@ def test_weak_actuator_gives_its_share_of_the_force_and_friction_is_a_share_too(
     batch = BallbotBatch("stabilize", 3, robot="rolling", randomization="unknown", compile=False)
     batch.reset(seed=0)
     batch.step(torch.zeros(3, 2))
-    frictions = [batch.robot(i).friction for i in range(3)]
+    frictions = batch.model(batch.state.drawn.unbind(0)).friction.tolist()
     assert len(set(frictions)) == 3
     assert 0.549 < min(frictions) < max(frictions) < 1.001
     plain = make_env(physics="rk4", randomization=robots)

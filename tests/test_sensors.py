@@ -103,7 +103,7 @@ def test_a_copy_goes_on_with_the_same_readings():
     np.testing.assert_array_equal(other.step([0.1, 0.0, 0.0])[0], first)
     env.set_state(held)
     np.testing.assert_array_equal(env.step([0.1, 0.0, 0.0])[0], first)
-    with pytest.raises(ValueError, match="another observation"):
+    with pytest.raises(ValueError, match="another randomization, history or observation"):
         BallbotEnv(robot="omni", physics="rk4").set_state(held)
 
 

@@ -158,7 +158,7 @@ def test_bad_start_is_refused_and_changes_nothing(make_vec):
     vec.reset(seed=0)
     before = vec.batch.state
     for options, message in (
-        ({"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a limit"),
+        ({"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate limits"),
         ({"constants": {"tempo": 1.0}}, "no constants"),
         ({"constants": [[0.5, 1.0], [2.0, 1.0]]}, "radius must exceed"),
     ):
