@@ -1,11 +1,10 @@
-"""How trajectories, episodes, optima and leaderboard rows show themselves: a line, and in notebooks a table.
+"""How trajectories, episodes, optima and leaderboard rows show themselves in a line, and motions in 3D.
 
 Their 3D replays and figures are drawn by `ballbot_train.report`, which is imported when it is asked for.
 """
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,19 +24,8 @@ class Displayed:
         """What there is to say in a line: figures with their units, by what they are."""
         raise NotImplementedError
 
-    def _table(self) -> dict[str, str]:
-        return self.facts()
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{name} {value}' for name, value in self.facts().items())})"
-
-    def _repr_html_(self) -> str:
-        cell = '<t{0} style="text-align:left">{1}</t{0}>'
-        rows = (
-            cell.format("h", html.escape(name)) + cell.format("d", html.escape(value))
-            for name, value in self._table().items()
-        )
-        return "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
 
 
 class Moving(Displayed):
@@ -47,9 +35,6 @@ class Moving(Displayed):
     def motion(self) -> Trajectory:
         """The motion that is shown."""
         return getattr(self, "trajectory")  # noqa: B009 (a field of the subclasses)
-
-    def _table(self) -> dict[str, str]:
-        return self.facts() | self.motion.facts()
 
     def show(self, *others: Moving, labels: Sequence[str] = (), robot: str | BallbotParams = "paper") -> Path | None:
         """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.

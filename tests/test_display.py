@@ -40,26 +40,21 @@ def optimum(motion):
 
 
 SHOWN = {
-    "trajectory": (ride(), "peak tilt 28.6°", '<th style="text-align:left">peak tilt</th>'),
-    "episode": (episode(ride()), "cost 12.35", "peak force"),
-    "optimum": (optimum(ride()), "status optimal", "2.00 m/s"),
+    "trajectory": (ride(), "peak tilt 28.6°"),
+    "episode": (episode(ride()), "cost 12.35"),
+    "optimum": (optimum(ride()), "status optimal"),
     "row": (
         summarize([replace(result(controller="<b>mine", cost=12.0 + i), episode=i) for i in range(5)]),
         "mean regret",
-        "&lt;b&gt;mine",
     ),
 }
 
 
 @pytest.mark.parametrize("name", SHOWN)
-def test_what_is_shown_is_a_short_line_and_a_small_table(name):
-    shown, line, table = SHOWN[name]
+def test_what_is_shown_is_a_short_line(name):
+    shown, line = SHOWN[name]
     assert line in repr(shown)
     assert len(repr(shown)) < 140
-    page = shown._repr_html_()
-    assert table in page
-    assert "\n\n" not in page  # Markdown would end a block of HTML there
-    assert len(page) < 3_000
 
 
 def test_what_is_plotted_is_a_figure_of_all():

@@ -79,15 +79,6 @@ class Row(Displayed):
             "mean regret": percent(self.regret_mean),
         }
 
-    def _table(self) -> dict[str, str]:
-        return self.facts() | {
-            "95 % interval": f"{percent(self.regret_low)} to {percent(self.regret_high)}",
-            "median regret": percent(self.regret_median),
-            "median peak tilt": f"{self.peak_tilt_median:.1f}°",
-            "median settle time": f"{self.settle_time_median:.2f} s",
-            "mean force": f"{self.effort_mean:.0f} N",
-        }
-
 
 def summarize(results: Sequence[Result], seed: int = 0) -> Row:
     """The leaderboard row of one controller on one task; seed is of the bootstrap."""
