@@ -115,11 +115,6 @@ class PlayPage:
                 self._bind(slider, partial(playground.set_plant, stress), partial(playground.plant.get, stress))
             told = gui.add_button("All as the controllers believe")
             told.on_click(self._asking(lambda _: [playground.set_plant(stress, 0.0) for stress in STRESSES]))
-        self._build_time()
-        self._refresh()
-
-    def _build_time(self) -> None:
-        gui, playground = self._gui, self.playground
         with gui.add_folder("Time"):
             actions = {
                 "Play / pause": ("space", self._toggle),
@@ -135,6 +130,7 @@ class PlayPage:
             self._bind(shown, lambda name: playground.begin(episodes[name]), lambda: str(playground.episode))
         for label, (key, action) in actions.items():
             gui.add_command(label, hotkey=key).on_trigger(self._asking(lambda _, action=action: action()))
+        self._refresh()
 
     def _bind(self, control: Any, apply: Callable[[Any], object], read: Callable[[], Any]) -> None:
         """Lets a control change the playground. What is refused goes back to what `read` says."""

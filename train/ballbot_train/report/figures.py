@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib import patches
-from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -53,7 +52,19 @@ def trajectory_figure(title: str, takes: Sequence[Take], markers: Sequence[Marke
         axis.axhline(0, color="0.6", lw=0.6)
     for key in ("lean", "force"):
         axes[key].set_xlabel("time, s")
-    _draw_path(axes["path"], takes, markers)
+    path = axes["path"]
+    for take in takes:
+        name = f"{take.label}, {take.note}" if take.note else take.label
+        path.plot(*take.trajectory.x[:, :2].T, take.style, color=take.color, lw=2, label=name)
+    for marker in markers:
+        look = {"fill": not marker.ring, "ls": "--" if marker.ring else "-", "color": marker.color[:3]}
+        path.add_patch(patches.Circle(marker.position, marker.radius, **look, alpha=0.4)).set_zorder(0)
+    for mark, x in (("o", takes[0].trajectory.x[0]), ("s", takes[0].trajectory.x[-1])):
+        path.plot(*x[:2], mark, color="k", ms=5)
+    path.set_aspect("equal", adjustable="datalim")
+    path.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
+    path.grid(alpha=0.3)
+    path.legend(fontsize=9, loc="best")
     return figure
 
 
@@ -157,18 +168,3 @@ def plain(figure: Figure) -> None:
             axis.set_minor_formatter(LogFormatter())
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _draw_path(axis: Axes, takes: Sequence[Take], markers: Sequence[Marker]) -> None:
-    for take in takes:
-        name = f"{take.label}, {take.note}" if take.note else take.label
-        axis.plot(*take.trajectory.x[:, :2].T, take.style, color=take.color, lw=2, label=name)
-    for marker in markers:
-        look = {"fill": not marker.ring, "ls": "--" if marker.ring else "-", "color": marker.color[:3]}
-        axis.add_patch(patches.Circle(marker.position, marker.radius, **look, alpha=0.4)).set_zorder(0)
-    for mark, x in (("o", takes[0].trajectory.x[0]), ("s", takes[0].trajectory.x[-1])):
-        axis.plot(*x[:2], mark, color="k", ms=5)
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=9, loc="best")

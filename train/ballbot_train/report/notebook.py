@@ -41,7 +41,11 @@ def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Bal
 
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
     """See `ballbot_gym.display.Moving.plot`."""
-    return _figure(figures.trajectory_figure("", _takes(shown, names), _markers(shown)))
+    figure = figures.trajectory_figure("", _takes(shown, names), _markers(shown))
+    figures.plain(figure)
+    if _in_notebook():  # so that it shows figures as pictures, also those that pyplot did not make
+        import_module("matplotlib_inline.backend_inline")
+    return figure
 
 
 def _takes(shown: Sequence[Moving], names: Sequence[str]) -> list[Take]:
@@ -58,13 +62,6 @@ def _takes(shown: Sequence[Moving], names: Sequence[str]) -> list[Take]:
 
 def _markers(shown: Sequence[Moving]) -> tuple[Marker, ...]:
     return tuple(dict.fromkeys(marker for one in shown for marker in getattr(one, "markers", ())))
-
-
-def _figure(figure: Figure) -> Figure:
-    figures.plain(figure)
-    if _in_notebook():  # so that it shows figures as pictures, also those that pyplot did not make
-        import_module("matplotlib_inline.backend_inline")
-    return figure
 
 
 def _in_notebook() -> bool:

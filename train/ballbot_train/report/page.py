@@ -20,7 +20,6 @@ from ballbot_gym.params import BallbotParams
 from ballbot_train.report.replay import Replay, Take
 
 _ASSETS = Path(__file__).parent / "assets"
-_WORD_COLUMNS = 2  # of a table: the first columns hold words, the others hold numbers
 _REPLAY_DT = 0.02  # s, between the states in the page
 
 
@@ -48,7 +47,6 @@ def report_page(
         title=title,
         header=header,
         rows=rows,
-        word_columns=_WORD_COLUMNS,
         data=scene_data(replays[0].params) | {"episodes": episodes} if episodes else {},
         pictures={
             name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
