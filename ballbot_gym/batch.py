@@ -18,22 +18,19 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from ballbot_gym.lazy import install
-
-try:
-    import torch
-except ImportError as error:
-    raise ImportError(f"batches of environments need torch: {install('train')}") from error
-
 from ballbot_gym import counter_rng, dynamics, sensors
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import make_task
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import DERIVED, BallbotParams
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import first_violated, limit_names, outcome
+
+with imports_of("a batch of environments", "train"):
+    import torch
 
 _log = logging.getLogger(__name__)
 

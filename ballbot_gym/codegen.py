@@ -11,19 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ballbot_gym.lazy import install
-
-try:
-    import casadi
-except ImportError as error:
-    raise ImportError(
-        f'environments in machine code need CasADi: {install("baselines")}. Or give engine="torch"'
-    ) from error
-
 from ballbot_gym import dynamics, ops
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import outcome
+
+with imports_of("the machine code of batches", "baselines"):
+    import casadi
 
 LANES = 16
 """Robots per block: as many float32 as an AVX-512 register holds."""
@@ -73,7 +68,7 @@ _TRUTH = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, *_LOGIC}
 
 
 def source(task: Task, params: BallbotParams, double: bool) -> str:
-    """The C code of a task and a robot, with the functions `step`, `help`, `start` and `observe` of native.c.
+    """The C code of a task and a robot, with the functions `step`, `start` and `observe` of native.c.
 
     Args:
         task: the task.

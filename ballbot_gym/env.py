@@ -61,9 +61,39 @@ class EnvState(NamedTuple):
     """What sensors remember, where they are what is observed; see `sensors.MEMORY`."""
 
 
+class TaskEnv:
+    """What single and vector environments of a task share."""
+
+    task: Task
+    params: BallbotParams
+    randomization: Randomization
+    closed = False
+    most_steps: int | None = None
+    """Control steps after which an episode is truncated, where they are fewer than the task's."""
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The registered spec, with the number of control steps of these episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec_of(spec, self.task, self.params, self.randomization, self.most_steps)
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """What can end an episode; `info["violated"]` is an index of it."""
+        return limit_names(self.task, self.params)
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
+
+
 @fixed("task", "params", "randomization", "history", "observation", "physics", "render_mode")
 @fixed("action_space", "observation_space")
-class BallbotEnv(gymnasium.Env):
+class BallbotEnv(TaskEnv, gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
     The reward of a step is `task.survival_reward` · control_dt less what the step cost. A failure ends the episode, and its
@@ -143,7 +173,6 @@ class BallbotEnv(gymnasium.Env):
             ImportError: physics="bullet" without a usable PyBullet, "mujoco" without MuJoCo, or render_mode="human" without
                 viser.
         """
-        self._spec: EnvSpec | None = None
         self._page: Viewer | None = None
         self._state: State = ()  # until the first reset
         self.params = checked_robot(robot, params)
@@ -184,7 +213,6 @@ class BallbotEnv(gymnasium.Env):
         self._steps, self._survive = self.task.steps, self.task.survival_reward * self.task.control_dt
         self._grips, self._force_limit, self._human = self.params.grips, self.params.force_limit, render_mode == "human"
         self._steps_left = self._taken = 0
-        self._closed = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -279,20 +307,6 @@ class BallbotEnv(gymnasium.Env):
         return seen, self._survive - did[1] + did[2], terminated, did[4] > 0, info
 
     @property
-    def spec(self) -> EnvSpec | None:
-        """The registered spec, with the number of control steps of this env's episodes."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec_of(spec, self.task, self.params, self.randomization)
-
-    @property
-    def limit_names(self) -> tuple[str, ...]:
-        """What can end an episode; `info["violated"]` is an index of it."""
-        return limit_names(self.task, self.params)
-
-    @property
     def episode_params(self) -> BallbotParams:
         """The robot of the running episode: `params`, unless randomized."""
         return self._robot
@@ -368,14 +382,14 @@ class BallbotEnv(gymnasium.Env):
     def __getstate__(self) -> dict[str, Any]:
         self.np_random  # noqa: B018  an env that was never seeded is seeded here, so that its copy draws the same episodes
         kept = {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_page", "_judge")}
-        return kept | {"_memory": () if self._closed else self._simulator.memory()}
+        return kept | {"_memory": () if self.closed else self._simulator.memory()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         memory = state.pop("_memory")
         self.__dict__.update(state)
         self._page = self._judge = None
         self._simulator = make_simulator(self.physics, self.params, self.task.control_dt, self._physics_dt)
-        if self._closed:
+        if self.closed:
             self._simulator.close()
         elif self._state:
             self._use_code()
@@ -384,16 +398,12 @@ class BallbotEnv(gymnasium.Env):
 
     def close(self) -> None:
         """Releases the physics client and the page; may be called again."""
-        self._closed = True
+        self.closed = True
         self._steps_left = 0
         self._simulator.close()
         if self._page is not None:
             self._page.close()
             self._page = None
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
 
     def _set_constants(self, c: State) -> None:
         """Makes c the constants of the episode."""

@@ -40,23 +40,23 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
         NoMachineCodeError: it cannot be compiled.
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
-    compiler = _compiler()
-    if compiler is None or compiler in _hanging:
+    program = compiler()
+    if program is None or program in _hanging:
         raise NoMachineCodeError
     try:
         folder = cache_folder()
         _make_private(folder)
-        key = hashlib.sha256("\0".join([source, _machine(compiler), *flags, *_FLAGS]).encode()).hexdigest()[:24]
+        key = hashlib.sha256("\0".join([source, _machine(program), *flags, *_FLAGS]).encode()).hexdigest()[:24]
         path = folder / f"{name}-{key}.so"
         if not _is_whole(path):
-            _build(compiler, source, path, flags)
+            _build(program, source, path, flags)
         return path
     except subprocess.CalledProcessError as error:
-        raise NoMachineCodeError(f"{compiler} failed: {error.stderr.strip()[-300:]}") from error
+        raise NoMachineCodeError(f"{program} failed: {error.stderr.strip()[-300:]}") from error
     except subprocess.TimeoutExpired as error:
-        _hanging.add(compiler)
+        _hanging.add(program)
         raise NoMachineCodeError(
-            f"{compiler} did not answer within {error.timeout:g} s, and is not asked again"
+            f"{program} did not answer within {error.timeout:g} s, and is not asked again"
         ) from error
     except (OSError, RuntimeError) as error:
         # a program that cannot be run, no home, or a folder that cannot be written
@@ -129,17 +129,12 @@ def _is_whole(path: Path) -> bool:
     return hashlib.sha256(content[:-_DIGEST]).digest() == content[-_DIGEST:]
 
 
-def compiler() -> str | None:
-    """The path of a C compiler; None where there is none."""
-    return shutil.which(os.environ.get("CC", "cc")) or shutil.which("gcc") or shutil.which("clang")
-
-
 @cache
-def _compiler() -> str | None:
-    """The same, and a word in the log where there is none."""
-    path = compiler()
+def compiler() -> str | None:
+    """The path of a C compiler; None, and a word in the log, where there is none."""
+    path = shutil.which(os.environ.get("CC", "cc")) or shutil.which("gcc") or shutil.which("clang")
     if path is None:
-        _log.warning("no C compiler found: optimization and many environments at once are several times slower")
+        _log.warning("no C compiler found: environments and optimization are several times slower")
     return path
 
 

@@ -229,27 +229,19 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
     look_at(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + TILT * B);
 }
 
-/* Takes chunks of the batch and does their steps, until none is left. */
-static void take_chunks(Memory *m) {
+/* One control step of a batch. Threads that call it with the same memory take chunks in turns, until all are done. */
+void step(Memory *m) {
     for (;;) {
         const int64_t first = __atomic_fetch_add(&m->taken, CHUNK, __ATOMIC_RELAXED);
         if (first >= m->B)
-            return;
+            break;
         const int64_t last = first + CHUNK < m->B ? first + CHUNK : m->B;
         step_chunk(m, first, last);
         __atomic_fetch_add(&m->done, last - first, __ATOMIC_RELEASE);
     }
-}
-
-/* One control step of a batch. */
-void step(Memory *m) {
-    take_chunks(m);
     while (__atomic_load_n(&m->done, __ATOMIC_ACQUIRE) < m->B) /* other threads finish their last chunks */
         sched_yield();
 }
-
-/* Helps with a step that another thread does, or does nothing if that is over. */
-void help(Memory *m) { take_chunks(m); }
 
 void start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
            real *x, real *c) {

@@ -62,7 +62,7 @@ class BallbotNative:
             task, num_envs, params: as of `BallbotBatch`.
             dtype: np.float32 or np.float64.
             threads: among which large batches are divided.
-            code: the library of `codegen`'s functions; default, those of the task and the robot, once they were checked.
+            code: the library of `codegen`'s functions; default, that of the task and the robot.
 
         Raises:
             NoMachineCodeError: CasADi or a C compiler is missing, or the task cannot be traced.
@@ -73,7 +73,7 @@ class BallbotNative:
         self.observation = "state"
         self.most_steps, self.restarts = task.steps, True
         self._state: State = None
-        self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
+        self._code = code or _code(task, params, dtype is np.float64)
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
         self._seen_rows = task.observation_size(params)
@@ -110,7 +110,7 @@ class BallbotNative:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._code = _checked_code(self.task, self.params, self.dtype is np.float64)
+        self._code = _code(self.task, self.params, self.dtype is np.float64)
 
     def initial_state(
         self,
@@ -221,7 +221,7 @@ class BallbotNative:
         if self.num_envs >= _PARALLEL_FROM:
             for jobs in _helpers(self.threads - 1):
                 if jobs.empty():  # else a helper is late, and need not be told twice
-                    jobs.put((self._code.help, memory))
+                    jobs.put((self._code.step, memory))
         self._code.step(memory)
 
 
@@ -251,16 +251,12 @@ def _pointer(array: np.ndarray) -> int:
         return array.ctypes.data
 
 
-@cache
-def _checked_code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
-    """The library of a task and a robot, if its functions compute the same with CasADi's symbols as with numbers.
+def _check(code: ctypes.CDLL, task: Task, params: BallbotParams, double: bool) -> None:
+    """Raises a NoMachineCodeError unless functions compute the same with CasADi's symbols as with numbers.
 
     A symbol that is made a float, for one, becomes NaN without a word.
-
-    Raises:
-        NoMachineCodeError: see `BallbotNative`.
     """
-    code, dtype = _code(task, params, double), np.float64 if double else np.float32
+    dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
     actions = np.asfortranarray(np.array(actions, dtype)[:, : params.action_size])
     own = BallbotNative(task, len(actions), dtype, params, code=code)
@@ -275,12 +271,11 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDL
     for name in expected.keys() - {"now", "end"}:
         if not np.allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
-    return code
 
 
 @cache
 def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
-    """The library of a task and a robot.
+    """The library of a task and a robot, once it was checked.
 
     Raises:
         NoMachineCodeError: see `BallbotNative`.
@@ -297,13 +292,13 @@ def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
     memory = ctypes.POINTER(_Memory)
     signatures = {
         "step": [memory],
-        "help": [memory],
         "start": [count] * 2 + [pointer] * 3 + [ctypes.c_int] + [pointer] * 2,
         "observe": [count] * 2 + [pointer] * 6,
     }
     for name, signature in signatures.items():
         function = getattr(library, name)
         function.argtypes, function.restype = signature, None
+    _check(library, task, params, double)
     return library
 
 

@@ -145,11 +145,10 @@ def _code(key: Any, compute: Callable[..., Sequence[Any]], counts: Sequence[int]
     except TypeError:  # a task that has no hash
         return None
     _codes[key] = None
-    if machine_code.compiler() is not None:
-        try:
-            _codes[key] = _checked(compute, counts, in_place)
-        except Exception as error:  # no cache, or whatever code of users raises that meets a traced number
-            _log.info("%s stays in Python: %s: %s", key, type(error).__name__, error)
+    try:
+        _codes[key] = _checked(compute, counts, in_place)
+    except Exception as error:  # no compiler or cache, or whatever code of users raises that meets a traced number
+        _log.info("%s stays in Python: %s: %s", key, type(error).__name__, error)
     return _codes[key]
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -20,28 +19,21 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
-from ballbot_gym.env import make_task
-from ballbot_gym.lazy import install
+from ballbot_gym.env import TaskEnv, make_task
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.registry import spec_of
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.sensors import observation_space
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import limit_names
 
-try:
+with imports_of('make_vec without vectorization_mode="sync" and physics="rk4"', "train"):
     import torch
-except ImportError as error:
-    raise ImportError(
-        f"vector environments need torch: {install('train')}. Or use gymnasium.make_vec(..., "
-        'vectorization_mode="sync", physics="rk4"), which needs none'
-    ) from error
 
-from ballbot_gym.autoreset import Info, as_array, filled, info_of, step
-from ballbot_gym.batch import BallbotBatch, BatchState, check_starts, dtype_named, tilt_of
+    from ballbot_gym.autoreset import Info, as_array, filled, info_of, step
+    from ballbot_gym.batch import BallbotBatch, BatchState, check_starts, dtype_named, tilt_of
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
@@ -62,7 +54,7 @@ class VectorState(NamedTuple):
 
 @fixed("task", "params", "randomization", "history", "observation", "num_envs", "render_mode", "autoreset_mode")
 @fixed("action_space", "observation_space", "single_action_space", "single_observation_space")
-class BallbotVectorEnv(gymnasium.vector.VectorEnv):
+class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
 
     Spaces, rewards, ends and `info` are those of `BallbotEnv(physics="rk4")`, in float32 by default. `autoreset_mode` is one
@@ -126,7 +118,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
         if engine not in _ENGINES:
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
-        self._spec: EnvSpec | None = None
         params = checked_robot(robot, params)
         task = make_task(task, params, **task_fields)
         if physics != "rk4":
@@ -160,22 +151,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space = observation_space(self.task, self.params, self.history, self.observation)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.batch.most_steps = _most_steps(max_episode_steps, self.task)
+        self.most_steps = self.batch.most_steps = _most_steps(max_episode_steps, self.task)
         self.batch.restarts = self.autoreset_mode is AutoresetMode.SAME_STEP
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """The registered spec, with the number of control steps of these envs' episodes."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec_of(spec, self.task, self.params, self.randomization, self.batch.most_steps)
-
-    @property
-    def limit_names(self) -> tuple[str, ...]:
-        """What can end an episode; `infos["violated"]` has indices of it."""
-        return limit_names(self.task, self.params)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -320,10 +297,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 f"the state is of {len(state.ended)} envs of {state.task}; this one has {self.num_envs} of {self.task}"
             )
         self.batch.state, self._ended = state.batch, state.ended
-
-    def _check_open(self) -> None:
-        if self.closed:
-            raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
 
     @property
     def _state(self) -> BatchState:

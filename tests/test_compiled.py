@@ -14,7 +14,7 @@ import numpy as np
 from ballbot_baselines import compiled
 from ballbot_gym import machine_code
 
-needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(machine_code.compiler() is None, reason="no C compiler")
 posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
 
 
@@ -138,12 +138,12 @@ def fake_compiler(folder, tmp_path, monkeypatch):
         program.write_bytes(content)
         program.chmod(0o755)
         monkeypatch.setenv("CC", str(program))
-        machine_code._compiler.cache_clear()
+        machine_code.compiler.cache_clear()
         return str(program)
 
     yield make
     monkeypatch.undo()
-    machine_code._compiler.cache_clear()
+    machine_code.compiler.cache_clear()
     machine_code._machine.cache_clear()
     machine_code._hanging.clear()
 
