@@ -1,7 +1,7 @@
 """What vector envs do where episodes end: a step of a `BallbotBatch` in each of Gymnasium's modes, and what infos say."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,28 +19,11 @@ Info = dict[str, np.ndarray]
 """What an info says of B environments, with the keys of `BallbotEnv`'s: of a step, or of the start of an episode."""
 
 
-class VectorStep(NamedTuple):
-    """The result of one control step of B environments, in NumPy arrays; as of `BatchStep`."""
-
-    observation: np.ndarray
-    """(B, no) float32."""
-    reward: np.ndarray
-    """(B,) float64."""
-    terminated: np.ndarray
-    """(B,) bool."""
-    truncated: np.ndarray
-    """(B,) bool."""
-    ended: np.ndarray
-    """(n,) indices of the envs whose episode ended."""
-    final_observation: np.ndarray
-    """(n, no) float32, what these saw at its end."""
-    now: Info
-    """Of the envs now."""
-    end: Info
-    """Of the step even where its end began a new episode; else as `now`."""
+Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+"""What `BallbotVectorEnv.step` returns."""
 
 
-def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -> VectorStep:
+def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -> Step:
     """One control step of a batch, with NumPy arrays in and out.
 
     Args:
@@ -58,6 +41,8 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
     before: Any = batch.state
     with torch.no_grad():
         result: Any = _advance(batch, torch.from_numpy(actions).to(batch.device), waiting)
+        state: Any = batch.state
+        tilt, last_tilt = (as_array(tilt_of(x.unbind(0))) for x in (state.x, result.final_x))
     result = result._make(map(as_array, result))
     reward, cost = (part.astype(np.float64, copy=False) for part in (result.reward, result.cost))
     ended = (result.terminated | result.truncated).nonzero()[0]
@@ -71,13 +56,47 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
         parts[1, failed] = reward[failed] - survive  # the cost has a failure's price too
         if batch.task.first_exit:
             parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * result.success[ended]
-    state, did = batch.state, (result.force, result.success, result.violated >= 0, result.clipped, result.grip)
-    end = now = info_of(state, result.tilt, result.violated, cost, parts, *did)
-    if batch.restarts and ended.size:
-        end = info_of(before._replace(x=result.final_x), result.final_tilt, result.violated, cost, parts, *did)
-        now = info_of(state, result.tilt, result.violated, *(_without(part, ended) for part in (cost, parts, *did)))
     seen, last = (part.astype(np.float32, copy=False) for part in (result.observation, result.final_observation))
-    return VectorStep(seen, reward, result.terminated, result.truncated, ended, last[ended], now, end)
+    violated, end = result.violated, None
+    now = cost, parts, result.force, result.success, violated >= 0, result.clipped, result.grip
+    if batch.restarts and ended.size:
+        end = info_of(before._replace(x=result.final_x), last_tilt, violated, *now)
+        now = tuple(_without(part, ended) for part in now)
+    info = info_of(state, tilt, violated, *now)
+    return told(seen, reward, result.terminated, result.truncated, info, end, last[ended])
+
+
+def told(
+    observation: np.ndarray,
+    reward: np.ndarray,
+    terminated: np.ndarray,
+    truncated: np.ndarray,
+    now: Info,
+    end: Info | None,
+    last: np.ndarray,
+) -> Step:
+    """A step as Gymnasium tells it, with masks in its infos.
+
+    Args:
+        observation: (B, no) float32.
+        reward: (B,) float64.
+        terminated, truncated: (B,) bool.
+        now: of the envs now; where an episode ended and another began, of the start, as after `reset`.
+        end: of the step itself, where such episodes ended; else None.
+        last: (n, no) float32, what the n envs whose episodes ended saw at the end.
+    """
+    infos: dict[str, Any] = {}
+    if end is not None:
+        done = terminated | truncated
+        infos = {"final_info": masked(end, done), "final_obs": np.full(observation.shape, np.nan, np.float32)}
+        infos["final_obs"][np.flatnonzero(done)] = last
+        infos["_final_info"] = infos["_final_obs"] = done
+    return observation, reward, terminated, truncated, infos | masked(now, filled(True, len(reward)))
+
+
+def masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
+    """An info with Gymnasium's masks (B,) of valid entries."""
+    return info | dict.fromkeys([f"_{name}" for name in info], mask)
 
 
 def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None) -> BatchStep:
@@ -91,7 +110,6 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
         **{name: getattr(result, name).masked_fill(wait, 0) for name in _NOTHING_DONE},
         violated=result.violated.masked_fill(wait, -1),
         observation=torch.where(wait[:, None], batch.observe(batch.state), result.observation),
-        tilt=tilt_of(batch.state.x.unbind(0)),
     )
 
 

@@ -110,10 +110,6 @@ class BatchStep(NamedTuple):
     """(2, B) N, what the actuator applied."""
     clipped: torch.Tensor
     """(B,) bool: the action was outside [−1, 1]."""
-    final_tilt: torch.Tensor
-    """(B,) rad, of `final_x`; carries no gradient."""
-    tilt: torch.Tensor
-    """(B,) rad, of `final_x`, or where an episode ended of the next one's initial state; carries no gradient."""
     grip: torch.Tensor
     """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction that the step needs; (0, B)
     where friction is unlimited. It carries no gradient."""
@@ -387,8 +383,6 @@ class BallbotBatch:
             violated=did.violated,
             force=torch.stack(force),
             clipped=torch.where(any_of(part.abs() > 1.0 for part in asked), 1.0, 0.0),
-            final_tilt=tilt_of(end),
-            tilt=tilt_of(new.x),
             grip=grip,
         )
         return self._stacked(new), result

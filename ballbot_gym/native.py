@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.autoreset import Info, VectorStep, info_of, step
+from ballbot_gym.autoreset import Info, Step, info_of, step, told
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.machine_code import NoMachineCodeError
@@ -74,10 +74,14 @@ class BallbotNative:
         self.most_steps, self.restarts = task.steps, True
         self._state: State = None
         self._code = code or _code(task, params, dtype is np.float64)
-        self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
         self._seen_rows = task.observation_size(params)
         self._told_rows = params.state_size + 1 + params.action_size + (4 if params.grips else 0)
+        size, nothing = self.num_envs, np.zeros((0, self.num_envs), dtype)
+        x, c = (np.zeros((rows, size), dtype) for rows in (params.state_size, len(task.constant_names)))
+        seeds = np.array(seeds_of(int(np.random.SeedSequence().generate_state(1)[0]), size))
+        begun: Any = x, c, *np.zeros((2, size), np.int64), seeds, *(nothing,) * 4
+        self._unstarted: State = BatchState(*begun)
         self._kinds = [self._written(restarts) for restarts in (False, True)]
 
     @property
@@ -93,16 +97,12 @@ class BallbotNative:
             ValueError: it is not.
         """
         if state is not None:
-            size = self.num_envs
-            arrays = {"x": (self.params.state_size, size), "c": (len(self.task.constant_names), size)}
-            arrays |= dict.fromkeys(("steps", "episode", "seed"), (size,))
-            given = state._asdict()
-            for name, shape in arrays.items():
-                dtype = self.dtype if name in ("x", "c") else np.int64
-                given[name] = np.ascontiguousarray(given[name], dtype)
-                if given[name].shape != shape:
-                    raise ValueError(f"{name} of a state must have shape {shape}, not {given[name].shape}")
-            state = BatchState(**given)
+            parts = []
+            for name, part, own in zip(BatchState._fields, state, self._unstarted, strict=True):
+                parts.append(np.ascontiguousarray(part, own.dtype))
+                if parts[-1].shape != own.shape:
+                    raise ValueError(f"{name} of a state must have shape {own.shape}, not {parts[-1].shape}")
+            state = BatchState(*parts)
         self._state = state
 
     def __getstate__(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class BallbotNative:
     ) -> State:
         """As `BallbotBatch.initial_state`, with NumPy arrays."""
         old = self.state
-        state = self._unstarted() if old is None else old._make(part.copy() for part in old)
+        state: State = BatchState._make(part.copy() for part in old or self._unstarted)
         which = self._all if old is None or mask is None else np.flatnonzero(mask)
         state.episode[which] += old is not None
         if seed is not None:
@@ -142,14 +142,14 @@ class BallbotNative:
         """(B,) rad, of a state."""
         return self._seen(state)[1]
 
-    def step(self, actions: np.ndarray, waiting: np.ndarray | None = None) -> VectorStep:
+    def step(self, actions: np.ndarray, waiting: np.ndarray | None = None) -> Step:
         """Holds forces for one control step; see `autoreset.step`."""
         old = self.state
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         begins, restarts = self.restarts or waiting is not None, self.restarts
         empty = np.empty
-        made = told, seen, pay, flags, counts, c, last = [empty(*kind) for kind in self._kinds[restarts]]
+        made = rows, seen, pay, flags, counts, c, last = [empty(*kind) for kind in self._kinds[restarts]]
         given = actions
         if any(stride % actions.itemsize for stride in actions.strides):
             actions = actions.copy()
@@ -166,15 +166,15 @@ class BallbotNative:
         violated, steps, episode = counts[0], counts[1], counts[2]  # to unpack it takes three times as long
         if not begins:
             episode, c = old.episode, old.c
-        self._state = old._replace(x=told[: self.params.state_size], c=c, steps=steps, episode=episode)
+        self._state = old._replace(x=rows[: self.params.state_size], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
         ended = flags[5].nonzero()[0]
-        now = end = self._info(self._state, told, pay[1:5], flags[2:5], violated)
+        now, end = self._info(self._state, rows, pay[1:5], flags[2:5], violated), None
         if restarts and ended.size:
-            told = told[self._told_rows :]
-            end = self._info(old._replace(x=told[: self.params.state_size]), told, pay[5:], flags[6:], violated)
-        last = (last if restarts else observation).take(ended, 0)
-        return VectorStep(observation, pay[0], flags[0], flags[1], ended, last, now, end)
+            rows = rows[self._told_rows :]
+            end = self._info(old._replace(x=rows[: self.params.state_size]), rows, pay[5:], flags[6:], violated)
+            last = last.take(ended, 0)
+        return told(observation, pay[0], flags[0], flags[1], now, end, last)
 
     def _written(self, restarts: bool) -> list[tuple[tuple[int, int], np.dtype]]:
         """Shapes and kinds of what a step writes, in the order of `_Memory`."""
@@ -190,23 +190,13 @@ class BallbotNative:
             ((size * kept, self._seen_rows), single),
         ]
 
-    def _info(self, state: State, told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray) -> Info:
+    def _info(self, state: State, rows: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray) -> Info:
         """An info of a state and of rows that native.c has written."""
         tilt = self.params.state_size
         grip = tilt + 1 + self.params.action_size
-        force, (success, failure, clipped) = told[tilt + 1 : grip], flags[:3]
-        did = pay[0], pay[1:], force, success, failure, clipped, told[grip : self._told_rows]
-        return info_of(state, told[tilt], violated, *did)
-
-    def _unstarted(self) -> State:
-        """A state before the first episodes, with random seeds."""
-        size = self.num_envs
-        x, c, none = (
-            np.zeros((rows, size), self.dtype) for rows in (self.params.state_size, len(self.task.constant_names), 0)
-        )
-        seeds = np.array(seeds_of(self._entropy, size))
-        fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none, none, none)
-        return BatchState(*fields)
+        force, (success, failure, clipped) = rows[tilt + 1 : grip], flags[:3]
+        did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._told_rows]
+        return info_of(state, rows[tilt], violated, *did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and (B,) their tilts."""
@@ -267,9 +257,11 @@ def _check(code: ctypes.CDLL, task: Task, params: BallbotParams, double: bool) -
     found = {"first observation": own.observe(first), "start": first.x, "constants": first.c}
     expected = {"first observation": batch.observe(start), "start": start.x, "constants": start.c}
     for values, done in ((found, own.step(actions)), (expected, step(batch, actions, None))):
-        values |= done._asdict() | done.now | {f"final {k}": part for k, part in done.end.items()}
-    for name in expected.keys() - {"now", "end"}:
-        if not np.allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
+        *returned, infos = done
+        ends = {f"final {name}": part for name, part in infos.pop("final_info", {}).items()}
+        values |= dict(zip(("observation", "reward", "terminated", "truncated"), returned, strict=True)) | infos | ends
+    for name in expected:
+        if not np.allclose(found.get(name, np.nan), expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
 
 

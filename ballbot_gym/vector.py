@@ -32,7 +32,7 @@ from ballbot_gym.tasks import Task
 with imports_of('make_vec without vectorization_mode="sync" and physics="rk4"', "train"):
     import torch
 
-    from ballbot_gym.autoreset import Info, as_array, filled, info_of, step
+    from ballbot_gym.autoreset import as_array, filled, info_of, masked, step
     from ballbot_gym.batch import BallbotBatch, BatchState, check_starts, dtype_named, tilt_of
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         success, failure, clipped = np.zeros((3, self.num_envs), bool)
         none = filled(-1, self.num_envs)
         info = info_of(state, as_array(tilt), none, cost, parts, force, success, failure, clipped, grip)
-        return as_array(observation).astype(np.float32, copy=False), _masked(info, mask)
+        return as_array(observation).astype(np.float32, copy=False), masked(info, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -222,18 +222,9 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             )
         batch = self.batch
         result = step(batch, actions, waiting) if isinstance(batch, BallbotBatch) else batch.step(actions, waiting)
-        done = result.terminated | result.truncated
-        infos: dict[str, Any] = {}
         if not batch.restarts:
-            self._ended = done
-        elif result.ended.size:
-            infos["final_info"] = _masked(result.end, done)
-            infos["final_obs"] = np.full(result.observation.shape, np.nan, np.float32)
-            infos["final_obs"][result.ended] = result.final_observation
-            infos["_final_info"] = infos["_final_obs"] = done
-            # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-        infos |= _masked(result.now, filled(True, self.num_envs))
-        return result.observation, result.reward, result.terminated, result.truncated, infos
+            self._ended = result[2] | result[3]
+        return result
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every env: of this object, or "episode_params", the robot of the running episode."""
@@ -330,11 +321,6 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
         check_starts(self.task, tuple(x), tuple(c), mask)
         return state._replace(x=self._to_batch(x))
-
-
-def _masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
-    """An info with Gymnasium's masks (B,) of valid entries."""
-    return info | dict.fromkeys([f"_{name}" for name in info], mask)
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":

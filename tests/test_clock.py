@@ -43,8 +43,8 @@ def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, par
                 mask = np.array([True, False])
                 batch.state = batch.initial_state(mask=torch.as_tensor(mask) if name == "torch" else mask)
             step = batch.step(torch.as_tensor(action) if name == "torch" else action)
-            seen.append(np.asarray(step.observation))
-            paid.append(np.asarray(step.reward))
+            seen.append(np.asarray(step[0]))
+            paid.append(np.asarray(step[1]))
         found[name] = np.array(seen), np.array(paid)
         state = batch.state
     for mine, theirs in zip(found["native"], found["torch"], strict=True):

@@ -175,7 +175,7 @@ def test_a_state_of_another_shape_is_refused_before_machine_code_reads_it():
     envs.state = state._replace(x=np.asfortranarray(state.x, np.float64))  # another order and type are taken
     first = envs.step(np.zeros((3, 2), np.float32, order="F"))
     envs.state = state
-    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F")).end["state"], first.end["state"])
+    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F"))[4]["state"], first[4]["state"])
 
 
 @needs_compiler
