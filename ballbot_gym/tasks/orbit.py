@@ -67,27 +67,18 @@ class Orbit(Task):
     | control_dt | how long each force is held | s | 0.02 |
     | max_tilt | tilt of a fall | rad | 80° |
     | survival_reward | paid for every second lived | 1/s | 100 |
-    | arena_factor | how far from the origin the ball may go | r | 2 |
+    | arena_factor | how far from the origin the ball may go, above 1 | r | 2 |
     """
 
     radius_weight: float = 10.0
-    """Of e_r², 1/(m² s)."""
     velocity_weight: float = 2.0
-    """Of |e_v|², s/m²."""
     lean_rate_weight: float = 0.02
-    """Of γ̇² + θ̇², s."""
     effort_weight: float = 2e-5
-    """Of Fx² + Fy², 1/(N² s)."""
     min_radius: float = 1.0
-    """m."""
     max_radius: float = 3.0
-    """m."""
     min_steady_tilt: float = math.radians(10)
-    """rad."""
     max_steady_tilt: float = math.radians(45)
-    """rad."""
     arena_factor: float = 2.0
-    """How far from the origin the ball may go, in radii of the circle; above 1."""
 
     id = "BallbotOrbit-v0"
     mirrors = (

@@ -61,21 +61,13 @@ class Stabilize(Task):
     """
 
     position_weight: float = 1.0
-    """Of x² + y², 1/(m² s)."""
     rest_weight: float = 0.5
-    """Of squared leans, speeds and lean rates, in SI units, 1/s."""
     effort_weight: float = 5e-4
-    """Of Fx² + Fy², 1/(N² s)."""
     start_position: float = 2.0
-    """m."""
     start_speed: float = 5.0
-    """m/s."""
     start_lean: float = 0.6
-    """rad."""
     start_lean_rate: float = 1.0
-    """rad/s."""
     arena_radius: float = 10.0
-    """How far from the origin the ball may go, m."""
 
     state_draws = 8
     id = "BallbotStabilize-v0"

@@ -72,17 +72,11 @@ class Turn(Task):
     """
 
     time_weight: float = 5.0
-    """Cost of a second, 1/s."""
     lean_weight: float = 0.5
-    """Of squared leans and lean rates, in SI units, 1/s."""
     effort_weight: float = 2e-4
-    """Of Fx² + Fy², 1/(N² s)."""
     min_speed: float = 2.0
-    """m/s."""
     max_speed: float = 10.0
-    """m/s."""
     arena_radius: float = 20.0
-    """How far from the gate the ball may go, m."""
 
     MAX_SPEED: ClassVar[float] = 12.0
     """Largest speed that an episode may have, m/s."""

@@ -73,15 +73,10 @@ class Weave(Task):
     """
 
     position_weight: float = 1.0
-    """Of the squared distance to the goal, 1/(m² s)."""
     rest_weight: float = 0.5
-    """Of squared leans, speeds and lean rates, in SI units, 1/s."""
     effort_weight: float = 5e-4
-    """Of Fx² + Fy², 1/(N² s)."""
     ball_radius: float = 0.1
-    """The robot's, m."""
     arena_radius: float = 12.0
-    """How far from the goal the ball may go, m."""
 
     id = "BallbotWeave-v0"
     frame = "slalom"
