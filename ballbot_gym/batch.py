@@ -22,7 +22,7 @@ from ballbot_gym import counter_rng, dynamics, sensors
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import DERIVED, BallbotParams
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.seeding import seeds_of
@@ -176,8 +176,6 @@ class BallbotBatch:
         self.state: BatchState | None = None
         self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
         self.restarts = True  # else envs stay at the ends of their episodes
-        for name in DERIVED:  # else torch.compile would see another robot at the second step, and compile anew
-            getattr(self.params, name)
         self._substeps = dynamics.substeps_for(self.task.control_dt)
         self.randomization.delay_steps(self.task.control_dt)  # raises an error where it is no whole number of these
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])

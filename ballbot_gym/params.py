@@ -2,17 +2,13 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
 
 from ballbot_gym import files
 from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number, is_positive
-
-_Value = TypeVar("_Value")
 
 _PACKAGE = Path(__file__).parent
 _IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf", _PACKAGE.parent / "urdf"
@@ -69,24 +65,25 @@ class UrdfError(ValueError):
     """A URDF that does not describe a ballbot; the message names the file, the element and the fault."""
 
 
-class _Kept(Generic[_Value]):
-    """A property that is computed once. functools has one that takes a lock, through which torch.compile cannot see."""
+class _Derived:
+    """What follows from the fields of a robot. Computed once, because equations of motion read it all the time."""
 
-    def __init__(self, compute: Callable[[Any], _Value]):
-        self._compute, self.__doc__ = compute, compute.__doc__
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, instance: Any, owner: type | None = None) -> _Value:
-        if instance is None:
-            return self  # pyright: ignore[reportReturnType]  # asked of the class, as documentation does
-        value = instance.__dict__[self._name] = self._compute(instance)
-        return value
+    total_mass: float
+    """Ball and body, kg."""
+    moving_mass: float
+    """What a horizontal acceleration of the upright robot moves: ball and body, and what the ball's rolling adds, kg."""
+    weight: float
+    """Of ball and body, N."""
+    grips: bool
+    """Whether the floor's force is limited by friction, so that the robot can lose its grip."""
+    first_moment: float
+    """m·l, the body's mass times its centre's height above the ball's, kg·m."""
+    pivot_inertia: float
+    """I + m·l², the body's transverse inertia about the ball's centre, kg·m²."""
 
 
 @dataclass(frozen=True)
-class BallbotParams:
+class BallbotParams(_Derived):
     """Masses and lengths of the ballbot.
 
     | field | meaning | unit |
@@ -153,6 +150,17 @@ class BallbotParams:
         if is_number(self.inertia) and is_number(self.axial_inertia) and self.axial_inertia > 2 * self.inertia:
             # Bullet would take 0 for both, without a word
             raise ValueError(f"BallbotParams: axial_inertia must be at most twice inertia, not {self.axial_inertia}")
+        total = self.ball_mass + self.body_mass
+        derived = {
+            "total_mass": total,
+            "moving_mass": total + self.ball_inertia / self.ball_radius**2 if self.rolls else total,
+            "weight": total * self.gravity,
+            "grips": not (is_number(self.friction) and self.friction == math.inf),
+            "first_moment": self.body_mass * self.com_height,
+            "pivot_inertia": self.inertia + self.body_mass * self.com_height**2,
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         """All fields, but wheels only where there are some: records of robots without name them by this."""
@@ -168,36 +176,6 @@ class BallbotParams:
     def action_size(self) -> int:
         """Components of a force or action: x and y, or one for each wheel."""
         return 2 if self.wheels is None else 3
-
-    @_Kept
-    def total_mass(self) -> float:
-        """Ball and body, kg."""
-        return self.ball_mass + self.body_mass
-
-    @_Kept
-    def moving_mass(self) -> float:
-        """What a horizontal acceleration of the upright robot moves: ball and body, and what the ball's rolling adds, kg."""
-        return self.total_mass + self.ball_inertia / self.ball_radius**2 if self.rolls else self.total_mass
-
-    @_Kept
-    def weight(self) -> float:
-        """Of ball and body, N."""
-        return self.total_mass * self.gravity
-
-    @_Kept
-    def grips(self) -> bool:
-        """Whether the floor's force is limited by friction, so that the robot can lose its grip."""
-        return not (is_number(self.friction) and self.friction == math.inf)
-
-    @_Kept
-    def first_moment(self) -> float:
-        """m·l, the body's mass times its centre's height above the ball's, kg·m."""
-        return self.body_mass * self.com_height
-
-    @_Kept
-    def pivot_inertia(self) -> float:
-        """I + m·l², the body's transverse inertia about the ball's centre, kg·m²."""
-        return self.inertia + self.body_mass * self.com_height**2
 
     @classmethod
     def from_urdf(cls, path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -> "BallbotParams":
@@ -216,12 +194,14 @@ class BallbotParams:
                 chain differs from the one that the closed-form dynamics describe.
         """
         urdf = _Urdf(Path(path))
-        rolls, wheels = urdf.root.find("joint[@name='roll']") is not None, urdf.wheels()
+        rolls, has_wheels = (urdf.root.find(query) is not None for query in ("joint[@name='roll']", "wheels"))
         numbers = {name: urdf.number(*places[0]) for name, places in _PLACES.items() if rolls or name != "ball_inertia"}
         friction = math.inf if urdf.root.find(_FRICTION[0]) is None else urdf.number(*_FRICTION)
+        wheel = {field.name: urdf.number("wheels", field.name) for field in fields(Wheels) if has_wheels}
         try:
+            wheels = Wheels(**wheel) if wheel else None
             params = cls(**numbers, gravity=float(gravity), rolls=rolls, friction=friction, wheels=wheels)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise urdf.error(str(error)) from None
         urdf.check_alike(params._written(), rolls)
         if (effort := urdf.number(*_PLACES["force_limit"][1])) != params.force_limit:
@@ -259,10 +239,6 @@ def default_params() -> BallbotParams:
     return BallbotParams.from_urdf()
 
 
-DERIVED = tuple(name for name, part in vars(BallbotParams).items() if isinstance(part, _Kept))
-"""Properties that are computed once."""
-
-
 class _Tree(ElementTree.TreeBuilder):
     """Builds elements of XML without a DOCTYPE, whose entities could unfold to a hundred times the file."""
 
@@ -288,16 +264,15 @@ class _Urdf:
         return UrdfError(f"{self.path}: {text}")
 
     def element(self, query: str) -> ElementTree.Element:
-        """The element of a query that begins with a link or a joint by name."""
+        """The element of a query that begins with one in the root, such as a link or a joint by name."""
         whole, _, inner = query.partition("/")
-        tag, name = whole.removesuffix("']").split("[@name='")
-        elements = self.root.findall(whole)
+        called, elements = whole.replace("[@name=", " ").removesuffix("]"), self.root.findall(whole)
         if not elements:
-            raise self.error(f"{tag} '{name}' is missing")
+            raise self.error(f"{called} is missing")
         if len(elements) > 1:
-            raise self.error(f"{tag} '{name}' is there {len(elements)} times; it must be there once")
+            raise self.error(f"{called} is there {len(elements)} times; it must be there once")
         if (element := elements[0].find(inner or ".")) is None:
-            raise self.error(f"{tag} '{name}' has no <{inner.replace('/', '><')}>")
+            raise self.error(f"{called} has no <{inner.replace('/', '><')}>")
         return element
 
     def number(self, query: str, attribute: str) -> float:
@@ -309,19 +284,6 @@ class _Urdf:
                 f"{query}: {attribute} = '{text}' is not {'three numbers' if attribute == 'xyz' else 'a number'}"
             )
         return parts[-1]
-
-    def wheels(self) -> Wheels | None:
-        """Those of the element <wheels>, if there is one."""
-        if (element := self.root.find("wheels")) is None:
-            return None
-        numbers = {field.name: _parts(element.get(field.name, "")) for field in fields(Wheels)}
-        for name, parts in numbers.items():
-            if isinstance(parts, str) or len(parts) != 1:
-                raise self.error(f"wheels: {name} = '{element.get(name)}' is not a number")
-        try:
-            return Wheels(**{name: float(parts[0]) for name, parts in numbers.items()})
-        except ValueError as error:
-            raise self.error(str(error)) from None
 
     def check_alike(self, wanted: ElementTree.Element, rolls: bool) -> None:
         """Checks that every joint and link of a packaged URDF is here, with the same places, axes, masses and inertias."""

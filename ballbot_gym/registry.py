@@ -190,4 +190,4 @@ def restore(modules: tuple[str, ...], robots: Mapping[str, Robot]) -> None:
     for module in modules:
         import_module(module)
     for name, robot in robots.items():
-        register_robot(name, robot.urdf, robot.fields, robot.about)
+        register_robot(name, robot.params, robot.fields)

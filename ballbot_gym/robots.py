@@ -3,8 +3,7 @@
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,8 @@ class Robot:
     beyond this robot.
     """
 
-    about: str
-    urdf: Path | BallbotParams
-    """Its file, if it comes with the package; else what was read from its file."""
-    fields: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    params: BallbotParams
+    fields: Mapping[str, dict[str, float]]
 
 
 ROBOTS: dict[str, Robot] = {}
@@ -35,10 +32,7 @@ PAPER = "paper"
 
 
 def register_robot(
-    name: str,
-    urdf: str | Path | BallbotParams,
-    fields: Mapping[str, Mapping[str, float]] | None = None,
-    about: str = "",
+    name: str, urdf: str | Path | BallbotParams, fields: Mapping[str, Mapping[str, float]] | None = None
 ) -> None:
     """Gives a robot a name, under which environments, experts and commands know it.
 
@@ -47,7 +41,6 @@ def register_robot(
         urdf: its file, with the chain of joints that `BallbotParams.from_urdf` describes; or its parameters.
         fields: fields of tasks, by the task's name, that differ from the defaults, where the usual episodes are beyond it:
             `{"stabilize": {"start_lean": 0.3}}`.
-        about: what it is, in a line.
 
     Raises:
         ValueError: the name is no such word, or another robot has it.
@@ -63,13 +56,9 @@ def register_robot(
             'register_robot: fields must be fields by task, such as {"stabilize": {"start_lean": 0.3}}, '
             f"not {fields!r}"
         )
-    if not isinstance(urdf, BallbotParams):
-        urdf = Path(urdf)
-        # those that come with the package are read when they are first used, because most programs need one of them
-        urdf = urdf if urdf.parent == URDF_FOLDER else BallbotParams.from_urdf(urdf)
-    robot = Robot(about, urdf, dict(fields))
-    known = ROBOTS.get(name, robot)
-    if known != robot and (_params_of(known), known.fields) != (_params_of(robot), robot.fields):
+    params = urdf if isinstance(urdf, BallbotParams) else BallbotParams.from_urdf(urdf)
+    robot = Robot(params, {task: dict(own) for task, own in fields.items()})
+    if ROBOTS.get(name, robot) != robot:
         raise ValueError(f"register_robot: the name {name!r} is taken by another robot; give yours another name")
     ROBOTS[name] = robot
 
@@ -98,7 +87,7 @@ def short_name(name: str) -> str:
 
 
 def named_robot(name: str) -> BallbotParams:
-    """The robot of a name in `ROBOTS`, or of MODULE:NAME, read once from its URDF.
+    """The robot of a name in `ROBOTS`, or of MODULE:NAME.
 
     Raises:
         ValueError: no robot of that name.
@@ -106,21 +95,12 @@ def named_robot(name: str) -> BallbotParams:
     short = short_name(name) if isinstance(name, str) else name
     if short not in ROBOTS:
         raise ValueError(f"unknown robot {name!r}; known: {', '.join(map(repr, ROBOTS))}")
-    return _params_of(ROBOTS[short])
+    return ROBOTS[short].params
 
 
 def without_wheels() -> tuple[str, ...]:
     """Names of the robots that two forces move, for what knows no wheels."""
     return tuple(name for name in ROBOTS if named_robot(name).wheels is None)
-
-
-def _params_of(robot: Robot) -> BallbotParams:
-    return robot.urdf if isinstance(robot.urdf, BallbotParams) else _read(robot.urdf)
-
-
-@cache
-def _read(urdf: Path) -> BallbotParams:
-    return BallbotParams.from_urdf(urdf)
 
 
 def file_name(name: str, robot: str) -> str:
@@ -181,16 +161,13 @@ def own_fields(robot: str | BallbotParams, task: str) -> dict[str, float]:
     return dict(ROBOTS[name].fields.get(task, {}))
 
 
-register_robot(
-    "paper", URDF_PATH, about="the paper's: a ball that translates, on a floor that gives whatever force is asked"
-)
-register_robot(
+register_robot(PAPER, URDF_PATH)
+register_robot(  # the paper's with a ball that rolls, driven by a torque, on a floor with friction 0.8
     "rolling",
     ROLLING_URDF_PATH,
     {"stabilize": {"start_lean": 0.3, "start_lean_rate": 0.5}, "orbit": {"max_steady_tilt": 0.56}},
-    about="the paper's with a ball that rolls, driven by a torque, on a floor with friction 0.8",
 )
-register_robot(
+register_robot(  # Kugle V1 of Aalborg University, by its published numbers
     "kugle",
     URDF_FOLDER / "kugle.urdf",
     {
@@ -199,21 +176,12 @@ register_robot(
         "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15},
         "weave": {"ball_radius": 0.129},
     },
-    about="Kugle V1 of Aalborg University, by its published numbers",
 )
 _HEADING = {"heading_weight": 1.0}  # 1/s: with a free heading it pays to spin, which is far from linear
-register_robot(
-    "omni",
-    OMNI_URDF_PATH,
-    {
-        "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2} | _HEADING,
-        "turn": {"min_speed": 0.5, "max_speed": 1.5} | _HEADING,
-        "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15} | _HEADING,
-        "weave": {"ball_radius": 0.129} | _HEADING,
-    },
-    about="Kugle V1 with its three omni-wheels and motors: it yaws, and its torque falls with speed",
+register_robot(  # Kugle V1 with its three omni-wheels and motors: it yaws, and its torque falls with speed
+    "omni", OMNI_URDF_PATH, {task: fields | _HEADING for task, fields in ROBOTS["kugle"].fields.items()}
 )
-register_robot(
+register_robot(  # the same with motors for leans of 30°
     "omni_strong",
     URDF_FOLDER / "omni_strong.urdf",
     {
@@ -222,5 +190,4 @@ register_robot(
         "orbit": {"max_steady_tilt": 0.52} | _HEADING,
         "weave": {"ball_radius": 0.129} | _HEADING,
     },
-    about="the same with motors for leans of 30°",
 )

@@ -134,7 +134,7 @@ def test_shards_of_a_robot_are_of_its_own_task(tmp_path):
 
 def test_demonstrations_of_a_robot_on_a_smoother_floor_are_those_of_the_robot_that_learners_know(tmp_path, monkeypatch):
     smoother = replace(named_robot("rolling"), friction=0.7)
-    monkeypatch.setitem(ROBOTS, "smoother", replace(ROBOTS["rolling"], urdf=smoother))
+    monkeypatch.setitem(ROBOTS, "smoother", replace(ROBOTS["rolling"], params=smoother))
     config = DemoConfig("orbit", "lqr", episodes=2, physics="rk4", robot="smoother")
     write_shards(config, str(tmp_path / "set"), tmp_path / "out", 1)
     for robot in ("smoother", robot_name(smoother)):

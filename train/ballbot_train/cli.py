@@ -102,7 +102,7 @@ def _registered(options: list[str]) -> list[str]:
         elif word.endswith(".urdf") and "--robot" in (flag, *named[-1:]):
             path = Path(word)
             word = re.sub(r"\W", "_", path.stem.lower())
-            register_robot(word, path, about=str(path))
+            register_robot(word, path)
         named.append(f"{flag}{equals}{word}")
     return named
 
