@@ -109,7 +109,7 @@ def torque(radius: float, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
     return cos * t1 - sin * t2, sin * t1 + cos * t2, t3
 
 
-def wheel_forces(params: Any, x: Vector, force: Vector, yaw_torque: Any = 0.0) -> Vector:
+def wheel_forces(params: Any, x: Vector, force: Vector) -> Vector:
     """u (..., 3), N, that turns the ball as the force (..., 2), N, of a rolling robot without wheels: by r e_z × force.
 
     It makes up for the motors' loss of torque at the present speeds, and is not clipped.
@@ -118,7 +118,6 @@ def wheel_forces(params: Any, x: Vector, force: Vector, yaw_torque: Any = 0.0) -
         params: the robot.
         x: (..., 11) state.
         force: (..., 2), N.
-        yaw_torque: N·m, from the ball on the body about its axis, in addition.
     """
     _, _, gamma, theta, *_, psi, _, _ = ops.components(x)
     fx, fy = ops.components(force)
@@ -129,7 +128,7 @@ def wheel_forces(params: Any, x: Vector, force: Vector, yaw_torque: Any = 0.0) -
     drag = params.ball_radius * params.wheels.drag(params.force_limit)
     t1, t2, t3 = t1 + ACROSS * drag * w1, t2 + ACROSS * drag * w2, t3 + ALONG * drag * w3
     cos, sin = ops.cos(psi), ops.sin(psi)
-    t1, t2, t3 = cos * t1 + sin * t2, cos * t2 - sin * t1, t3 - yaw_torque / params.ball_radius
+    t1, t2 = cos * t1 + sin * t2, cos * t2 - sin * t1
     parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
     return ops.stack(tuple(parts), like=force)
 

@@ -19,7 +19,6 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
-from ballbot_gym.two_forces import TwoForces
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.play.simulation import World
 from ballbot_train.policy import PolicyController, PolicyNetwork
@@ -249,19 +248,6 @@ def test_a_batch_whose_equations_are_compiled_agrees_with_an_eager_one():
     results = [batch.step(actions) for batch in (*batches, copy.deepcopy(batches[0]))]
     for result in results[1:]:
         torch.testing.assert_close(result.final_x, results[0].final_x, rtol=1e-4, atol=1e-5)
-
-
-def test_two_forces_balance_it_and_hold_its_heading():
-    env = TwoForces(BallbotEnv(robot="omni", physics="rk4"))
-    gain = two_force_gain(env.unwrapped.params) / (omni.LEAST_FORCE * env.unwrapped.params.force_limit)
-    _, info = env.reset(options={"state": [0.3, -0.2, 0.05, 0.0, 0.1, 0.2, 0.0, 0.0, 0.8, 0.5, 0.0]})
-    terminated = truncated = False
-    while not (terminated or truncated):
-        _, _, terminated, truncated, info = env.step(-gain @ info["state"][:8])
-    assert info["success"]
-    assert np.abs(info["state"][8:]).max() < 0.01
-    with pytest.raises(ValueError, match="takes a BallbotEnv of a robot with wheels"):
-        TwoForces(BallbotEnv(physics="rk4"))
 
 
 def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
