@@ -33,7 +33,7 @@ def cost_of(x0: np.ndarray, c: np.ndarray, kept: tuple[int, ...], choice: Choice
     goal, obstacles = split_constants(c)
     rows = [obstacles[i] for i in kept]
     fewer = np.concatenate([goal, *rows, *[rows[-1]] * (MAX_OBSTACLES - len(rows))])
-    start = TASK.side_path(x0, goal, obstacles[list(kept)], choice)
+    start = TASK.routed_path(x0, fewer, choice)
     try:
         found = find_optimum(TASK, PARAMS, x0, fewer, paths=[start])
     except PlanError:

@@ -305,7 +305,7 @@ def test_guessed_paths_try_every_choice_of_sides_and_one_clears_all_obstacles(pa
         assert any((distances(path, obstacles) > obstacles[:, 2] + params.ball_radius).all() for path in paths)
         assert len(paths) == 2 ** len(obstacles)
         np.testing.assert_allclose([path[-1] for path in paths], np.tile(goal, (len(paths), 1)), atol=1e-9)
-        left = task.side_path(start, goal, obstacles, (1,) * len(obstacles))
+        left = task.routed_path(start, constants, (1,) * len(obstacles))
         assert sides_passed(left, constants) == (1,) * len(obstacles)
 
 

@@ -1,11 +1,19 @@
 """The robot's URDF in PyBullet, as a chain of joints, and with contact where the ball rolls."""
 
+import locale
+import math
+import tempfile
+import threading
 import weakref
+from pathlib import Path
 
 from ballbot_gym import omni
-from ballbot_gym.engines.bullet_client import connect, import_pybullet, joint_indices, load_robot, set_surface
+from ballbot_gym.engines.bullet_client import import_pybullet
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
 from ballbot_gym.params import BallbotParams
+
+_JOINTS = ("x", "y", "gamma", "theta", "psi")  # the last where wheels turn the body
+_loading = threading.Lock()
 
 _0 = (0.0, 0.0)
 _PRESSED = -1e-5  # m: height of the ball at reset, about where its weight presses it
@@ -28,14 +36,14 @@ class BulletSimulator(Simulator):
             RuntimeError: PyBullet has no client left.
         """
         substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
-        bullet = import_pybullet()
-        self._client = connect(bullet)
+        self._bullet = bullet = import_pybullet()
+        self._client = bullet.connect(bullet.DIRECT)
+        if self._client < 0:
+            raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
-        self._robot, self._joints = load_robot(bullet, self._client, params)
-        self._params = params
+        self._load(params)
         # Substeps run in C++ with the force held. Results are bit-identical to single steps, a third faster.
         bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
-        self._bullet = bullet
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
         # Joints are reset in place: reloading the URDF takes a hundred times longer.
@@ -69,8 +77,36 @@ class BulletSimulator(Simulator):
     def _reload(self, params: BallbotParams) -> None:
         check_kind(params, self._params)
         self._bullet.removeBody(self._robot, physicsClientId=self._client)
-        self._robot, self._joints = load_robot(self._bullet, self._client, params)
-        self._params = params
+        self._load(params)
+
+    def _load(self, params: BallbotParams) -> None:
+        """Loads the robot without motors, damping or joint speed limits."""
+        bullet, client, self._params = self._bullet, self._client, params
+        with tempfile.TemporaryDirectory() as folder, _loading:
+            path = Path(folder) / "ballbot.urdf"
+            path.write_text(params.to_urdf(), encoding="utf-8")
+            # Bullet reads numbers by the process's locale: with decimal commas it would take "0.5" for 0 without a word.
+            found = locale.setlocale(locale.LC_NUMERIC)
+            locale.setlocale(locale.LC_NUMERIC, "C")
+            try:
+                # Without this flag Bullet recomputes inertias from collision shapes.
+                options = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE, "physicsClientId": client}
+                self._robot = robot = bullet.loadURDF(str(path), **options)
+            finally:
+                locale.setlocale(locale.LC_NUMERIC, found)
+        bullet.setGravity(0, 0, -params.gravity, physicsClientId=client)
+        joints = range(bullet.getNumJoints(robot, physicsClientId=client))
+        # of every joint, and of the link that it carries, by the joint's name
+        self._index = {bullet.getJointInfo(robot, i, physicsClientId=client)[1].decode(): i for i in joints}
+        self._joints = tuple(self._index[name] for name in _JOINTS if name in self._index)
+        free = {"linearDamping": 0, "angularDamping": 0, "jointDamping": 0, "maxJointVelocity": 1e4}
+        for joint in (-1, *joints):
+            bullet.changeDynamics(robot, joint, physicsClientId=client, **free)
+        # Bullet's joints start with a velocity motor that holds them.
+        none = [0] * len(self._joints)
+        bullet.setJointMotorControlArray(
+            robot, self._joints, bullet.VELOCITY_CONTROL, forces=none, physicsClientId=client
+        )
 
 
 class BulletContactSimulator(BulletSimulator):
@@ -88,7 +124,7 @@ class BulletContactSimulator(BulletSimulator):
             0, bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client), physicsClientId=client
         )
         # Bullet multiplies the friction of both bodies. Rolling without slipping is friction's work alone.
-        set_surface(bullet, client, self._floor, -1, 1.0)
+        self._set_surface(self._floor, -1, 1.0)
         self._set_ball()
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
@@ -100,7 +136,7 @@ class BulletContactSimulator(BulletSimulator):
         bullet.resetJointStateMultiDof(self._robot, self._ball, (0, 0, 0, 1), spin, physicsClientId=client)
 
     def set_params(self, params: BallbotParams) -> None:
-        self._reload(params)  # in any case, so that nothing of the contact's settings is lost; see `set_surface`
+        self._reload(params)  # in any case, so that nothing of the contact's settings is lost; see `_set_surface`
         self._set_ball()
 
     def step(self, u: tuple[float, ...]) -> State:
@@ -134,9 +170,8 @@ class BulletContactSimulator(BulletSimulator):
 
     def _set_ball(self) -> None:
         bullet, client, robot = self._bullet, self._client, self._robot
-        index = joint_indices(bullet, client, robot)
-        self._ball, self._height = index["roll"], index["z"]
-        set_surface(bullet, client, robot, self._ball, min(self._params.friction, MOST_FRICTION))
+        self._ball, self._height = self._index["roll"], self._index["z"]
+        self._set_surface(robot, self._ball, min(self._params.friction, MOST_FRICTION))
         bullet.setJointMotorControl2(robot, self._height, bullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
         bullet.setJointMotorControlMultiDof(
             robot,
@@ -148,6 +183,15 @@ class BulletContactSimulator(BulletSimulator):
             force=(0, 0, 0),
             physicsClientId=client,
         )
+
+    def _set_surface(self, body: int, link: int, friction: float) -> None:
+        """Friction as given, and nothing else that acts at a contact."""
+        none = {"rollingFriction": 0, "spinningFriction": 0, "restitution": 0, "physicsClientId": self._client}
+        # A call that sets damping too would drop lateralFriction without a word.
+        self._bullet.changeDynamics(body, link, lateralFriction=friction, **none)
+        found = self._bullet.getDynamicsInfo(body, link, physicsClientId=self._client)[1]
+        if not math.isclose(found, friction, rel_tol=1e-6):
+            raise RuntimeError(f"PyBullet took {found} for a friction of {friction}")
 
 
 class BulletOmniSimulator(BulletContactSimulator):

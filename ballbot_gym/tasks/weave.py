@@ -201,16 +201,20 @@ class Weave(Task):
 
     def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
         """A path for every choice of sides, the shortest first: the best choice is mostly among the first three."""
-        goal, obstacles = split_constants(c)
-        paths = [
-            self.side_path(x, goal, obstacles, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))
-        ]
+        _, obstacles = split_constants(c)
+        paths = [self.routed_path(x, c, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))]
         paths.sort(key=lambda path: np.hypot(*np.diff(path, axis=0).T).sum())
         return paths
 
     def routed_path(self, x: np.ndarray, c: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
+        """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
         goal, obstacles = split_constants(c)
-        return self.side_path(x, goal, obstacles, sides[: len(obstacles)])
+        clearance = obstacles[:, 2] + self.ball_radius + 0.1
+        knots_x = np.concatenate([[x[0]], obstacles[:, 0], [goal[0]]])
+        knots_y = np.concatenate([[x[1]], obstacles[:, 1] + np.array(sides[: len(obstacles)]) * clearance, [goal[1]]])
+        s = np.minimum(self.control_dt * np.arange(self.steps + 1) / _GUESS_SECONDS, 1.0)
+        along = x[0] + (goal[0] - x[0]) * s**3 * (10 - 15 * s + 6 * s**2)  # minimum jerk
+        return then_stay(np.column_stack([along, catmull_rom(knots_x, knots_y, along)]), self.steps)
 
     def passed_obstacles(self, c: np.ndarray) -> np.ndarray:
         _, obstacles = split_constants(c)
@@ -220,15 +224,6 @@ class Weave(Task):
         far = c.copy()
         far[3::3] = c[1] + 4 * self.arena_radius
         return far
-
-    def side_path(self, x: np.ndarray, goal: np.ndarray, obstacles: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
-        """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
-        clearance = obstacles[:, 2] + self.ball_radius + 0.1
-        knots_x = np.concatenate([[x[0]], obstacles[:, 0], [goal[0]]])
-        knots_y = np.concatenate([[x[1]], obstacles[:, 1] + np.array(sides) * clearance, [goal[1]]])
-        s = np.minimum(self.control_dt * np.arange(self.steps + 1) / _GUESS_SECONDS, 1.0)
-        along = x[0] + (goal[0] - x[0]) * s**3 * (10 - 15 * s + 6 * s**2)  # minimum jerk
-        return then_stay(np.column_stack([along, catmull_rom(knots_x, knots_y, along)]), self.steps)
 
     def observe(self, x: Vector, c: Vector) -> Vector:
         px, py, *rest = ops.components(x)[:8]

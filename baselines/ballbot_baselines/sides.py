@@ -34,7 +34,7 @@ class Prediction:
 
     | field | shape | meaning |
     |---|---|---|
-    | sides | (2^n, n) | −1 or 1, as in `Weave.side_path` |
+    | sides | (2^n, n) | −1 or 1, as in `Weave.routed_path` |
     | costs | (B, 2^n) | what the choice costs more than the motion without obstacles |
     | passed | (B, n) | control steps at which obstacles are passed |
     | free | (B, steps+1) | the ground position across the way without obstacles, m |
