@@ -68,7 +68,7 @@ _TRUTH = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, *_LOGIC}
 
 
 def source(task: Task, params: BallbotParams, double: bool) -> str:
-    """The C code of a task and a robot, with the functions `step`, `start` and `observe` of native.c.
+    """The C code of a task and a robot, with the functions `step`, `ballbot_start` and `ballbot_observe` of native.c.
 
     Args:
         task: the task.

@@ -38,10 +38,9 @@ static void rows_copy(int rows, int64_t count, const real *from, int64_t sfrom, 
             to[i * sto + k] = from[i * sfrom + k];
 }
 
-/* Functions that others here call are static, lest the linker takes another library's of the same name. */
-
-/* Starts episodes in the count robots that which lists: states, and constants unless they are given. */
-static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
+/* Starts episodes in the count robots that which lists: states, and constants unless they are given. Its name and the next are
+   ours alone, lest the linker takes another library's of the same name for the calls below. */
+void ballbot_start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
                   real *x, real *c) {
     for (int64_t m = 0; m < count; m += LANES) {
         real z[AT_LEAST_1(DRAWS) * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, xs[STATES * LANES];
@@ -67,7 +66,7 @@ static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t 
 }
 
 /* What the count robots that which lists see, and their tilts. */
-static void look_at(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c,
+void ballbot_observe(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c,
                     real *seen, real *tilt) {
     for (int64_t m = 0; m < count; m += LANES) {
         real xs[STATES * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, taken[LANES] = {0}, ss[SEEN * LANES], ts[LANES];
@@ -225,8 +224,8 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
         episode[n] += 1;
         begun[count++] = n;
     }
-    begin(B, count, begun, m->seed, episode, 0, m->told, m->new_c);
-    look_at(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + TILT * B);
+    ballbot_start(B, count, begun, m->seed, episode, 0, m->told, m->new_c);
+    ballbot_observe(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + TILT * B);
 }
 
 /* One control step of a batch. Threads that call it with the same memory take chunks in turns, until all are done. */
@@ -241,14 +240,4 @@ void step(Memory *m) {
     }
     while (__atomic_load_n(&m->done, __ATOMIC_ACQUIRE) < m->B) /* other threads finish their last chunks */
         sched_yield();
-}
-
-void start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
-           real *x, real *c) {
-    begin(B, count, which, seed, episode, given, x, c);
-}
-
-void observe(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c, real *seen,
-             real *tilt) {
-    look_at(B, count, which, steps, x, c, seen, tilt);
 }

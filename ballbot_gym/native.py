@@ -130,7 +130,7 @@ class BallbotNative:
         if c is not None:
             state.c[:, which] = c[:, which]
         arrays, given = _pointers(which, state.seed, state.episode), c is not None
-        self._code.start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
+        self._code.ballbot_start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
         state.steps[which] = 0
         return state
 
@@ -203,7 +203,7 @@ class BallbotNative:
         seen = np.empty((self._seen_rows, self.num_envs), self.dtype)
         tilt = np.empty(self.num_envs, self.dtype)
         arrays = self._all, state.steps, state.x, state.c, seen, tilt
-        self._code.observe(self.num_envs, self.num_envs, *_pointers(*arrays))
+        self._code.ballbot_observe(self.num_envs, self.num_envs, *_pointers(*arrays))
         return seen, tilt
 
     def _run(self, memory: "_Memory") -> None:
@@ -284,8 +284,8 @@ def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
     memory = ctypes.POINTER(_Memory)
     signatures = {
         "step": [memory],
-        "start": [count] * 2 + [pointer] * 3 + [ctypes.c_int] + [pointer] * 2,
-        "observe": [count] * 2 + [pointer] * 6,
+        "ballbot_start": [count] * 2 + [pointer] * 3 + [ctypes.c_int] + [pointer] * 2,
+        "ballbot_observe": [count] * 2 + [pointer] * 6,
     }
     for name, signature in signatures.items():
         function = getattr(library, name)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -41,15 +41,6 @@ if TYPE_CHECKING:
 _ENGINES = ("auto", "native", "torch")
 
 _log = logging.getLogger(__name__)
-
-
-class VectorState(NamedTuple):
-    """What `BallbotVectorEnv.get_state` returns. It may be pickled."""
-
-    task: Task
-    batch: BatchState
-    ended: np.ndarray
-    """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
 @fixed("task", "params", "randomization", "history", "observation", "num_envs", "render_mode", "autoreset_mode")
@@ -266,28 +257,6 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             picture(Drawing(self.params, (Robot(x),), markers=tuple(self.task.markers(c))))
             for x, c in zip(states, constants, strict=True)
         )
-
-    def get_state(self) -> VectorState:
-        """The state of all envs in their episodes, from which `set_state` goes on bit-identically.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before `reset`.
-        """
-        self._check_open()
-        return VectorState(self.task, self._state, self._ended)
-
-    def set_state(self, state: VectorState) -> None:
-        """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
-
-        Raises:
-            ValueError: the state is of another task or of another number of envs.
-        """
-        self._check_open()
-        if state.task != self.task or len(state.ended) != self.num_envs:
-            raise ValueError(
-                f"the state is of {len(state.ended)} envs of {state.task}; this one has {self.num_envs} of {self.task}"
-            )
-        self.batch.state, self._ended = state.batch, state.ended
 
     @property
     def _state(self) -> BatchState:
