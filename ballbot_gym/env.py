@@ -447,12 +447,10 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             if self._state:  # its episode goes on where this one cannot start
                 self._judge.c[:] = self._constants
         task = self.task
-        limits = zip(task.limit_names, task.limits(x, task.at(c, 0.0)), strict=True)
-        violated = [name for name, limit in limits if not limit >= 0]
-        if violated:
+        if violated := task.violated(x, task.at(c, 0.0)):
             values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.OMNI_STATE, x, strict=False))
             raise ValueError(
-                f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
+                f"{task.id}: the start state is out of range: it violates the limit of {violated} ({values}; "
                 f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
             )
         return None, dynamics.tilt(x)

@@ -213,24 +213,24 @@ class BallbotParams(_Derived):
         return ElementTree.tostring(self._written(), encoding="unicode")
 
     def _written(self) -> ElementTree.Element:
-        root = _Urdf(OMNI_URDF_PATH if self.wheels else ROLLING_URDF_PATH if self.rolls else URDF_PATH).root
+        urdf = _Urdf(OMNI_URDF_PATH if self.wheels else ROLLING_URDF_PATH if self.rolls else URDF_PATH)
         for field in fields(Wheels) if self.wheels else ():
-            _found(root, "wheels").set(field.name, repr(getattr(self.wheels, field.name)))
+            urdf.element("wheels").set(field.name, repr(getattr(self.wheels, field.name)))
         for name, places in _PLACES.items():
             value = getattr(self, name)
             if name == "ball_inertia" and not self.rolls:
                 # a solid sphere's, which has no effect; a power would raise an OverflowError where a product is inf
                 value = 0.4 * self.ball_mass * self.ball_radius * self.ball_radius
             for query, attribute in places:
-                if (element := root.find(query)) is not None:  # only a ball that rolls collides
+                if (element := urdf.root.find(query)) is not None:  # only a ball that rolls collides
                     element.set(attribute, f"0 0 {value!r}" if attribute == "xyz" else repr(value))
-        ball = _found(root, _BALL[:-1])
+        ball = urdf.element(_BALL[:-1])
         if (contact := ball.find("contact")) is not None:
             ball.remove(contact)
         if self.friction != math.inf:
             contact = ElementTree.SubElement(ball, "contact")
             ElementTree.SubElement(contact, "lateral_friction").set("value", repr(self.friction))
-        return root
+        return urdf.root
 
 
 @cache
@@ -296,12 +296,6 @@ class _Urdf:
                 if found != right and (name, place) not in free:
                     what = f"{place} {attribute}".removeprefix(". ")
                     raise self.error(f"{each.tag} '{name}': {what} is {found}, and must be {right}")
-
-
-def _found(root: ElementTree.Element, query: str) -> ElementTree.Element:
-    element = root.find(query)
-    assert element is not None
-    return element
 
 
 def _attribute(element: ElementTree.Element, place: str, attribute: str) -> str | tuple[float, ...]:

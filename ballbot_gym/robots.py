@@ -98,11 +98,6 @@ def named_robot(name: str) -> BallbotParams:
     return ROBOTS[short].params
 
 
-def without_wheels() -> tuple[str, ...]:
-    """Names of the robots that two forces move, for what knows no wheels."""
-    return tuple(name for name in ROBOTS if named_robot(name).wheels is None)
-
-
 def file_name(name: str, robot: str) -> str:
     """A name of a file or folder, with that of the robot by name; the paper's robot adds nothing."""
     return name if robot == PAPER else f"{name}-{robot}"

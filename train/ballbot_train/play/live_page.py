@@ -13,7 +13,7 @@ from typing import Any
 
 from ballbot_gym import certified, dynamics
 from ballbot_gym.drawing import PUSH_SCALE
-from ballbot_gym.robots import without_wheels
+from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.console import markdown_text
@@ -102,7 +102,7 @@ class PlayPage:
         self._status = gui.add_markdown("")
         self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_world, lambda: playground.world.task_name)
         self._bind(
-            gui.add_dropdown("Robot", without_wheels()),
+            gui.add_dropdown("Robot", tuple(name for name in ROBOTS if ROBOTS[name].params.wheels is None)),
             lambda robot: playground.set_world(robot=robot),
             lambda: playground.world.robot,
         )
