@@ -2,17 +2,12 @@
 
 import warnings
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from ballbot_gym.engines.bullet import BulletContactSimulator, BulletOmniSimulator, BulletSimulator
-from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, has_pybullet, import_pybullet
+from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.engines.mujoco import (
-    MujocoContactSimulator,
-    MujocoOmniSimulator,
-    MujocoSimulator,
-    has_mujoco,
-    import_mujoco,
-)
+from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoOmniSimulator, MujocoSimulator, import_mujoco
 from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
@@ -47,8 +42,8 @@ _noticed: list[bool] = []
 
 def installed_physics() -> list[str]:
     """The physics that this machine can run, in the order of `PHYSICS`."""
-    there = {"bullet": has_pybullet(), "mujoco": has_mujoco(), "rk4": True}
-    return [name for name in PHYSICS if there[name]]
+    libraries = {"bullet": "pybullet", "mujoco": "mujoco", "rk4": "numpy"}
+    return [name for name in PHYSICS if find_spec(libraries[name]) is not None]
 
 
 def check_installed(physics: str) -> None:

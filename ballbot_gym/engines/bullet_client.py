@@ -1,7 +1,6 @@
 """PyBullet where it is installed, imported without a word."""
 
 import ctypes
-import importlib.util
 import os
 import sys
 from collections.abc import Iterator
@@ -9,11 +8,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from types import ModuleType
 
 HOW_TO_GET_IT = 'Get it with "pip install pybullet", under Python 3.11 or older: newer ones have no wheel.'
-
-
-def has_pybullet() -> bool:
-    """Whether PyBullet is installed."""
-    return importlib.util.find_spec("pybullet") is not None
 
 
 def import_pybullet() -> ModuleType:

@@ -1,6 +1,5 @@
 """The robot in MuJoCo, as a chain of joints, and with contact where the ball rolls."""
 
-import importlib.util
 import math
 from types import ModuleType
 from typing import Any
@@ -275,11 +274,6 @@ class MujocoOmniSimulator(MujocoContactSimulator):
                 biasprm=(0, 0, -damping, *[0] * 7),
                 gainprm=(1, *[0] * 9),
             )
-
-
-def has_mujoco() -> bool:
-    """Whether MuJoCo is installed."""
-    return importlib.util.find_spec("mujoco") is not None
 
 
 def import_mujoco() -> ModuleType:
