@@ -79,7 +79,7 @@ def test_a_learner_teaches_its_routes_first_and_keeps_them(monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
     monkeypatch.setattr(routing, "_DISTANCES", 1)
-    tiny = {"num_envs": 4, "horizon": 3, "iterations": 2, "one_way": True, "hidden": (8,)}
+    tiny = {"num_envs": 4, "horizon": 3, "iterations": 2, "hidden": (8,)}
     settings = replace(LEARNERS["shac"].settings("weave"), symmetry="routes", **tiny)
     learner = LEARNERS["shac"].make(TASK, PARAMS, settings, 0, None)
     before = [part.clone() for part in learner.network.routes.parameters()]

@@ -316,15 +316,3 @@ def test_field_that_is_not_positive_is_named(task, value):
             continue
         with pytest.raises(ValueError, match=f"{type(task).__name__}: {field.name} must be positive"):
             dataclasses.replace(task, **{field.name: value})
-
-
-def test_one_way_margins_are_no_wider_than_the_margins(task, rng, params):
-    """And the same where a task leaves one way alone."""
-    for _ in range(20):
-        x, c = task.sample(rng, params)
-        x = x + rng.normal(size=8)
-        margins, one_way = np.array(task.margins(x, c), float), np.array(task.one_way_margins(x, c), float)
-        assert margins.shape == one_way.shape
-        assert (one_way <= margins + 1e-12).all()
-        if not task.id.startswith("BallbotWeave"):
-            np.testing.assert_array_equal(one_way, margins)

@@ -242,19 +242,6 @@ class Task(ABC):
         """What optimizers keep ≥ 0. Every task has the tilt limit; obstacles add theirs."""
         return (dynamics.cos_tilt(x) - math.cos(self.max_tilt),)
 
-    def one_way_margins(self, x: Vector, c: Vector, sides: tuple[Any, ...] = ()) -> tuple[Any, ...]:
-        """The margins, with all ways closed but one where they leave several.
-
-        For learners that follow gradients, because no gradient leads from one side of an obstacle to the other. Episodes
-        neither end nor cost anything by these.
-
-        Args:
-            x: (..., 8) states.
-            c: (..., nc) constants.
-            sides: on which side each obstacle is to be passed, as a policy with routes decides; default, the task's choice.
-        """
-        return self.margins(x, c)
-
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:
         """Centre x, y and radius of the circle that the ball must not leave, m. A task overrides it with a closer one."""
         return 0.0, 0.0, 100.0

@@ -157,28 +157,6 @@ class Weave(Task):
             clearances.append((squared(px - ox, py - oy) - reach * reach) / (2 * reach))
         return (*super().margins(x, c), *clearances)
 
-    def one_way_margins(self, x: Vector, c: Vector, sides: tuple[Any, ...] = ()) -> tuple[Any, ...]:
-        """Obstacles one of whose sides is closed, by a wedge that opens away from the other.
-
-        By default the farther side from the line through the goal along x. The nearer side everywhere is the best choice of
-        four in five drawn slaloms, and costs 0.2 % more on average.
-
-        Args:
-            x: (..., 8) states.
-            c: (..., nc) constants.
-            sides: of each obstacle: 1 to pass on its left, −1 to pass on its right.
-        """
-        px, py, *_ = ops.components(x)
-        _, y_goal, *_ = ops.components(c)
-        clearances = []
-        for i, (ox, oy, reach) in enumerate(self._obstacles(c)):
-            # from the obstacle's centre towards the side that is closed
-            off = sides[i] * (oy - py) if sides else ops.where(oy < y_goal, oy - py, py - oy)
-            depth = ops.where(off > 0, off, 0.0)
-            length = 2 * ops.sqrt(reach * reach + depth * depth)  # so that it stays about a length deep in the wedge
-            clearances.append((squared(px - ox) - off * abs(off) - reach * reach) / length)
-        return (*super().margins(x, c), *clearances)
-
     def _obstacles(self, c: Vector) -> list[tuple[Any, Any, Any]]:
         """Centres x, y of all obstacles, and how near to these the ball's centre may come, m."""
         _, _, *numbers = ops.components(c)

@@ -71,8 +71,6 @@ class ShacConfig:
     """Distance to a margin where a penalty starts."""
     margin_penalty: float = 0.0
     """Per second and squared shortfall of it; 0: none."""
-    one_way: bool = False
-    """Weave stays on the sides where it started; not from scratch."""
 
 
 TUNED: dict[str, ShacConfig] = {
@@ -230,9 +228,7 @@ class _ExactGradient:
         shaped = cost = task.cost(before, force, task.at(state.c.unbind(0), time)) * dt + price * result.failure
         c = task.at(state.c.unbind(0), time + dt)
         if config.margin_penalty:
-            routes = self._trained.routes if config.one_way else None
-            sides = () if routes is None else routes.sides(observation.unbind(-1))
-            for margin in task.one_way_margins(x, c, sides) if config.one_way else task.margins(x, c):
+            for margin in task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - self._DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * dt * squared
@@ -444,7 +440,6 @@ def make(
     **world: Any,
 ) -> Shac | WholeEpisodes:
     """As of `Algorithm.make`, without demonstrations."""
-    for name in ("margin_clearance", "one_way"):
-        if getattr(config, name) and not config.margin_penalty:
-            raise ValueError(f"{name} needs margin_penalty above 0")
+    if config.margin_clearance and not config.margin_penalty:
+        raise ValueError("margin_clearance needs margin_penalty above 0")
     return (Shac if config.horizon else WholeEpisodes)(task, params, config, seed, start, **world)
