@@ -380,7 +380,7 @@ class BallbotBatch:
             failure=did.failure,
             violated=did.violated,
             force=torch.stack(force),
-            clipped=torch.where(any_of(part.abs() > 1.0 for part in asked), 1.0, 0.0),
+            clipped=torch.where(functools.reduce(operator.or_, (part.abs() > 1.0 for part in asked)), 1.0, 0.0),
             grip=grip,
         )
         return self._stacked(new), result
@@ -515,11 +515,6 @@ def check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:
             f"start states of envs {bad[:8]} violate limits of {task.id}: that of env {bad[0]} the limit of "
             f"{task.limit_names[int(violated[bad[0]])]}"
         )
-
-
-def any_of(conditions: Any) -> torch.Tensor:
-    """Elementwise or."""
-    return functools.reduce(operator.or_, conditions)
 
 
 def tilt_of(x: tuple) -> torch.Tensor:

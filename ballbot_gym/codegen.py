@@ -90,7 +90,7 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         block(
             "look",
             (("x", x), ("c", c), ("t", taken)),
-            (("seen", ops.components(task.seen(x, now))), ("tilt", (_tilt(x),))),
+            (("seen", ops.components(task.seen(x, now))), ("tilt", (dynamics.tilt(x),))),
         ),
         block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
         block("draw_state", (("z", z[1]), ("c", c)), (("x", task.start(z[1], c, params)),)),
@@ -196,11 +196,6 @@ def _advance(
         ("flags", (did.terminated, did.truncated, did.success, did.failure, clipped)),
         ("violated", (did.violated,)),
     )
-
-
-def _tilt(x: tuple) -> Any:
-    """As `dynamics.tilt`."""
-    return casadi.acos(ops.clip(dynamics.cos_tilt(x), -1.0, 1.0))
 
 
 def _symbols(name: str, count: int) -> tuple[Any, ...]:

@@ -320,7 +320,7 @@ def cos_tilt(x: Vector) -> Any:
 
 
 def tilt(x: Vector) -> Any:
-    """Angle between the body's axis and the vertical, rad, of state x (..., 8). Not for CasADi; use `cos_tilt` there.
+    """Angle between the body's axis and the vertical, rad, of state x (..., 8).
 
     Its gradient is infinite where the robot stands upright.
     """

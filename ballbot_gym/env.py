@@ -462,18 +462,13 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         c = _floats(task.draw_constants(tuple(draws[: task.constant_draws]), self.params))
         if constants is not None:
             if isinstance(constants, dict):
-                constants = self._replaced(c, constants)
+                check_constant_names(task, constants)
+                constants = [constants.get(name, value) for name, value in zip(task.constant_names, c, strict=True)]
             given = finite_array(constants, (len(task.constant_names),), "constants")
             task.check_constants(given, self.params)
             c = _floats(given)
         x = _floats(task.start(tuple(draws[task.constant_draws :]), c, self.params))
         return x if state is None else _floats(finite_array(state, (self.params.state_size,), "state")), c
-
-    def _replaced(self, c: State, named: dict[str, float]) -> list[Any]:
-        """The drawn constants c, of which some are replaced by name."""
-        names = self.task.constant_names
-        check_constant_names(self.task, named)
-        return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, ...], bool]:
         """The force, N, of an action, and whether it was clipped."""

@@ -49,7 +49,7 @@ def log(a: Any) -> Any:
 
 
 def arccos(a: Any) -> Any:
-    """Arc cosine, elementwise. Not for CasADi."""
+    """Arc cosine, elementwise."""
     return math.acos(a) if isinstance(a, float | int) else _library(a).arccos(a)
 
 

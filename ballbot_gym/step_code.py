@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -41,14 +41,8 @@ _JUDGED = 9  # an outcome, and the tilt
 State = tuple[float, ...]
 
 
-class Code(NamedTuple):
-    """A function of `traced.function`."""
-
-    call: Callable[[ctypes.c_void_p], None]
-    results: int
-    arguments: int
-    in_place: bool
-    """Whether the results replace the first arguments."""
+Code = tuple[Callable[[ctypes.c_void_p], None], bool, int, int]
+"""A function of `traced.function`, whether its results replace its first arguments, and how many it has of each."""
 
 
 class Work:
@@ -59,13 +53,14 @@ class Work:
     """
 
     def __init__(self, code: Code, arguments: int, results: int):
-        first = 1 if code.in_place else 1 + code.results  # of the arguments
-        memory = bytearray(8 * (first + code.arguments))
+        function, in_place, given, made = code
+        first = 1 if in_place else 1 + made  # of the arguments
+        memory = bytearray(8 * (first + given))
         self.numbers, self.check = np.frombuffer(memory), memoryview(memory).cast("d")
         self.given = self.numbers[first:]
         self.pack = partial(struct.Struct(f"{arguments}d").pack_into, memory, 8 * first)
         self.unpack = partial(struct.Struct(f"{results}d").unpack_from, memory, 8)
-        self.call = partial(code.call, ctypes.c_void_p(self.numbers.ctypes.data))
+        self.call = partial(function, ctypes.c_void_p(self.numbers.ctypes.data))
 
 
 def motion(params: BallbotParams, dt: float) -> Work | None:
@@ -166,11 +161,10 @@ def _checked(compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_pl
     ).compute  # it keeps the GIL: it is short
     call.argtypes, call.restype = (ctypes.c_void_p,), None
     rng, ends = np.random.default_rng(0), np.cumsum(counts)[:-1]
-    code = Code(call, 0, sum(counts), in_place)
     for _ in range(_TRIALS):
         given = rng.uniform(-1.5, 1.5, sum(counts))
         expected = compute(*(tuple(part.tolist()) for part in np.split(given, ends)))
-        code = code._replace(results=len(expected))
+        code = call, in_place, len(given), len(expected)
         work = Work(code, len(given), len(expected))
         work.given[:] = given
         work.call()
