@@ -19,7 +19,7 @@ _OPTIMUM = "task = make_task({task!r}); find_optimum(task, default_params(), *ep
 _FROM = {
     "env": "import gymnasium, ballbot_gym",
     "batch": "import torch; from ballbot_gym.batch import BallbotBatch; from ballbot_gym.tasks.stabilize import Stabilize",
-    "optimum": "from ballbot_baselines import find_optimum; from ballbot_baselines.certification import episode; "
+    "optimum": "from ballbot_baselines import find_optimum; from ballbot_gym.certified.cache import episode; "
     "from ballbot_gym.env import make_task; from ballbot_gym.params import default_params",
 }
 # the kernel's own peak of this program; getrusage's is that of the process that started it, where that one was larger

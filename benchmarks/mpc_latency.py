@@ -13,10 +13,10 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballbot_baselines.certification import episode
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import files
+from ballbot_gym.certified.cache import episode
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS

@@ -41,7 +41,7 @@ def planned(name: str, seed: int, indices: Sequence[int]) -> Iterator[jobs.Entry
         optimum, error = _found(task, x0, c)
         entry: jobs.Entry = {"episode": i, "seconds": time.process_time() - start, "error": error}
         if optimum is not None:
-            entry |= {"status": optimum.status, "cost": optimum.cost, "guess": optimum.guess}
+            entry |= {"status": optimum.status, "cost": optimum.cost}
         if optimum is not None and name == "weave" and i < _COMPARED:
             start = time.process_time()
             before = find_optimum(task, params, x0, c, paths=task.guess_paths(x0, c, params)[:_SHORTEST])
@@ -152,7 +152,6 @@ def _row(name: str, entries: Sequence[jobs.Entry]) -> dict[str, object]:
         "optimal": f"{np.mean([entry.get('status') == 'optimal' for entry in entries]):.4f}",
         "feasible": sum(entry.get("status") == "feasible" for entry in entries),
         "none": sum(bool(entry["error"]) for entry in entries),
-        "from_righting": sum(entry.get("guess") == -1 for entry in entries),
         "seconds_median": f"{np.median(seconds):.4f}",
         "seconds_p95": f"{np.percentile(seconds, 95):.4f}",
         "seconds_max": f"{np.max(seconds):.4f}",

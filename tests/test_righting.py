@@ -10,7 +10,6 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import LqrController, NmpcController, TrajoptController, certification, find_optimum, righting
 from ballbot_baselines.ocp import FEASIBLE, OcpSolver
-from ballbot_baselines.optimum import FROM_RIGHTING
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -34,7 +33,6 @@ def steep(params):
 
 def test_leaning_by_60_degrees_is_recovered_at_less_than_the_cost_of_staying_in_the_plane(steep):
     assert steep.is_optimal
-    assert steep.guess == FROM_RIGHTING
     assert steep.cost == pytest.approx(78.088156, rel=1e-6)
     # 99.31 is the stationary episode in the plane of the fall: a saddle point
     assert steep.cost < 99.31
@@ -93,8 +91,7 @@ def test_feasible_episode_without_an_optimum_is_returned_and_says_so(unconverged
 
 
 def test_feasible_episode_gets_no_certificate(unconverged):
-    ((_, error),) = certification.entries("stabilize", [0])
-    assert "only a feasible episode" in error
+    assert "only a feasible episode" in certification.entry("stabilize", 0)
 
 
 def test_simulated_recovery_is_a_plan_where_no_solver_finds_one(altered, make_env, params):

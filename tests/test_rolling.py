@@ -291,7 +291,7 @@ def test_simulated_recoveries_grip(rolling):
 def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
     """Only where friction is limited: the first two draws of episode 1 are refused here."""
     task = make_task("stabilize", "rolling")
-    refused = [certification.episode(task, rolling, 1, draw)[0] for draw in (0, 1)]
+    refused = [certified.cache.episode(task, rolling, 1, draw)[0] for draw in (0, 1)]
 
     def found(task, params, x, c, twice):
         if any((x == start).all() for start in refused):
@@ -303,12 +303,12 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
         )  # fmt: skip
 
     monkeypatch.setattr(certification, "find_optimum", found)
-    entries = list(certification.entries("stabilize", range(2), "rolling"))
+    entries = {i: certification.entry("stabilize", i, "rolling") for i in range(2)}
     states = certification.arrays(entries, task, rolling)["states"]
     for i, draw in ((0, 0), (1, 2)):
-        np.testing.assert_array_equal(states[i], certification.episode(task, rolling, i, draw)[0])
-    refused.append(certification.episode(Stabilize(), default_params(), 0)[0])
-    assert next(certification.entries("stabilize", [0], "paper")) == (0, "it cannot but slip")
+        np.testing.assert_array_equal(states[i], certified.cache.episode(task, rolling, i, draw)[0])
+    refused.append(certified.cache.episode(Stabilize(), default_params(), 0)[0])
+    assert certification.entry("stabilize", 0, "paper") == "it cannot but slip"
 
 
 def test_a_certified_set_is_of_one_robot(tmp_path):

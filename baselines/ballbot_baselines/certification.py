@@ -1,22 +1,20 @@
 """Computes the certified evaluation sets that `ballbot_gym.certified` loads.
 
-`entries` solves a few episodes after the other and yields a set of each alone, so that the work can be divided and continued.
+`entry` solves an episode and gives a set of it alone, so that the work can be divided and continued.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.batched import BatchOptima
-from ballbot_baselines.compiled import LANES
-from ballbot_baselines.optimum import Optimum, find_optimum, second_search
+from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_baselines.search import COARSE
 from ballbot_gym import dynamics
-from ballbot_gym.certified import EvaluationSet, cache
-from ballbot_gym.certified.cache import episode
+from ballbot_gym.certified import EvaluationSet
+from ballbot_gym.certified.cache import starts
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -25,50 +23,32 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
-Entry = tuple[int, EvaluationSet | str]
-"""The number of an episode, and a set of it alone with its optimum, or why none was found."""
 
-AT_ONCE = LANES
-"""Episodes whose second searches share the processor's lanes."""
-
-
-def entries(
-    task: str | Task,
-    indices: Iterable[int],
-    robot: str | BallbotParams = PAPER,
-    randomization: Randomization = Randomization(),
-) -> Iterator[Entry]:
-    """Solves episodes of a task for a robot, and yields one entry for each, in order.
+def entry(
+    task: str | Task, index: int, robot: str | BallbotParams = PAPER, randomization: Randomization = Randomization()
+) -> EvaluationSet | str:
+    """Solves an episode of a task for a robot: the set of it alone with its optimum, or why none was found.
 
     If the robot's friction is limited or the robot varies, an episode without an optimum is drawn again: some starts make the
     robot slip whatever it does, and only the search tells which.
 
     Args:
         task: the problem, or its name in `TASKS`.
-        indices: of the episodes.
-        robot: whose optima, or its name in `ROBOTS`.
-        randomization: what the robot and the actuator of each episode are drawn from.
+        index: of the episode.
+        robot: whose optimum, or its name in `ROBOTS`.
+        randomization: what the robot and the actuator of the episode are drawn from.
 
     Raises:
         ValueError: no task or robot of that name.
     """
-    task, params, left = make_task(task, robot), checked_robot(robot), iter(indices)
-    while some := list(itertools.islice(left, AT_ONCE)):
-        second = None
-        if not randomization.moves_optima:  # else each has another robot
-            x0, c = (np.array(part) for part in zip(*(episode(task, params, i, 0) for i in some), strict=True))
-            second = second_search(task, params, x0, c)
-        for k, index in enumerate(some):
-            found: EvaluationSet | str = ""
-            redrawn = None if params.grips or randomization.moves_optima else 1
-            for draw, start in enumerate(itertools.islice(cache.starts(task, params, index, randomization), redrawn)):
-                twice = True if second is None or draw else second.some(slice(k, k + 1))
-                try:
-                    found = _solved(task, params, randomization, *start, twice)
-                    break
-                except PlanError as error:
-                    found = str(error)
-            yield index, found
+    task, params, why = make_task(task, robot), checked_robot(robot), ""
+    redrawn = None if params.grips or randomization.moves_optima else 1
+    for start in itertools.islice(starts(task, params, index, randomization), redrawn):
+        try:
+            return _solved(task, params, randomization, *start)
+        except PlanError as error:
+            why = str(error)
+    return why
 
 
 def _solved(
@@ -78,12 +58,11 @@ def _solved(
     x0: np.ndarray,
     c: np.ndarray,
     drawn: tuple[float, ...],
-    twice: bool | BatchOptima,
 ) -> EvaluationSet:
     """The set of one episode; raises a PlanError where no optimum is found."""
-    optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn, twice)
+    optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn)
     if drawn and drawn[5] > 0:
-        ideal = _optimal(task, randomization.robot(params, drawn), x0, c, twice=True)
+        ideal = _optimal(task, randomization.robot(params, drawn), x0, c)
     return EvaluationSet(
         states=np.array([x0]),
         constants=np.array([c]),
@@ -98,8 +77,8 @@ def _solved(
 
 
 def _optimal(*problem: Any, **options: Any) -> Optimum:
-    """What `find_optimum` finds; raises a PlanError for an episode that is merely feasible."""
-    found = find_optimum(*problem, **options)
+    """What `find_optimum` finds in two searches; raises a PlanError for an episode that is merely feasible."""
+    found = find_optimum(*problem, twice=True, **options)
     if not found.is_optimal:
         raise PlanError(f"only a feasible episode of cost {found.cost:.6g} was found ({found.solver_status})")
     return found
@@ -112,7 +91,6 @@ def optimum_of(
     c: np.ndarray,
     randomization: Randomization,
     drawn: tuple[float, ...],
-    twice: bool | BatchOptima = True,
 ) -> Optimum:
     """The optimum of an episode for which a randomization drew this: of its own robot, and no force comes while it is late.
 
@@ -123,7 +101,6 @@ def optimum_of(
         c: (nc,) constants.
         randomization: without an actuator that lags; noise and pushes move no optimum.
         drawn: what its `draw` drew.
-        twice: as of `find_optimum`, where no force is late.
 
     Raises:
         PlanError: the robot violates a limit before it can be moved, or no try came to an optimum.
@@ -132,7 +109,7 @@ def optimum_of(
         params = randomization.robot(params, drawn)
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
-        return _optimal(task, params, x0, c, twice=twice)
+        return _optimal(task, params, x0, c)
     dt, none, states, cost = task.control_dt, np.zeros(params.action_size), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)
@@ -147,14 +124,14 @@ def optimum_of(
         # only over an even number of steps are choices of sides compared
         longer = replace(task, duration=rest.duration + dt)
         paths = [find_optimum(longer, params, states[-1], c, start=start).trajectory.x[:-1, :2]]
-    found = _optimal(rest, params, states[-1], c, paths=paths, start=start, twice=True)
+    found = _optimal(rest, params, states[-1], c, paths=paths, start=start)
     x = np.concatenate([states[:-1], found.trajectory.x])
     u = np.concatenate([np.zeros((delay, params.action_size)), found.trajectory.u])
     return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))
 
 
-def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:
-    """The optima of any episodes as arrays, for sets too large for an `EvaluationSet`.
+def arrays(entries: Mapping[int, EvaluationSet | str], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:
+    """The entries of any episodes as arrays, for sets too large for an `EvaluationSet`.
 
     | array | shape | holds |
     |---|---|---|
@@ -165,8 +142,8 @@ def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[
     | x, u | (Σ lengths + n, 8), (Σ lengths, 2) | the trajectories, one after another |
     | failed, errors | (m,) | episodes without an optimum, and why |
     """
-    found = {index: part for index, part in entries if isinstance(part, EvaluationSet)}
-    failed = {index: error for index, error in entries if isinstance(error, str)}
+    found = {index: part for index, part in entries.items() if isinstance(part, EvaluationSet)}
+    failed = {index: error for index, error in entries.items() if isinstance(error, str)}
     moved = [part.trajectories[0] for part in found.values()]
 
     def joined(name: str, *width: int) -> np.ndarray:

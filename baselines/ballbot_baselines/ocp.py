@@ -11,8 +11,6 @@ once (`compiled.py`). So time and memory grow linearly with N.
 """
 
 import functools
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -145,16 +143,6 @@ class OcpSolution:
         return self.success and self.is_within_limits
 
 
-class _Spent(threading.local):
-    """Wall time, s, that this thread has spent so far on making solvers, and in them."""
-
-    setup: float = 0.0
-    solving: float = 0.0
-
-
-spent = _Spent()
-
-
 class OcpSolver:
     """An `Ocp` over N intervals, ready to be solved from many starts.
 
@@ -181,7 +169,6 @@ class OcpSolver:
             barrier: the interior-point method's barrier parameter at the start. From near a solution, less takes fewer
                 iterations.
         """
-        began = time.perf_counter()
         self.ocp, self.intervals, self.solver = ocp, intervals, solver
         stages = ocp.stages
         paths, finals = stages.running.size - 1, stages.final.size - 1
@@ -205,7 +192,6 @@ class OcpSolver:
             options |= for_ipopt | {"ipopt": own | {"sb": "yes"}}
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
-        spent.setup += time.perf_counter() - began
 
     def solve(
         self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
@@ -224,7 +210,6 @@ class OcpSolver:
         p = np.asarray(p, np.float64)
         lower = _interleave(bounds.state_lower, bounds.input_lower)
         upper = _interleave(bounds.state_upper, bounds.input_upper)
-        start = time.perf_counter()
         result = self._nlpsol(
             x0=np.clip(_interleave(states, inputs), lower, upper),
             p=p,
@@ -233,7 +218,6 @@ class OcpSolver:
             lbg=self._g_lower,
             ubg=self._g_upper,
         )
-        spent.solving += time.perf_counter() - start
         stats = self._nlpsol.stats()
         status = _status(self.solver, stats)
         z = np.array(result["x"]).ravel()

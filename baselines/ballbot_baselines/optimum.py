@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from ballbot_baselines import batched
-from ballbot_baselines.ocp import spent
-from ballbot_baselines.search import ALL_GUESSES, FROM_RIGHTING, Found, attempts
+from ballbot_baselines.ocp import OcpSolution
+from ballbot_baselines.search import ALL_GUESSES, attempts
 from ballbot_baselines.shooting import Backoff, Shooting
 from ballbot_gym.checks import finite_array
 from ballbot_gym.display import Moving
@@ -27,11 +27,9 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 
-__all__ = ["ALL_GUESSES", "FROM_BATCH", "FROM_RIGHTING", "Backoff", "Optimum", "find_optimum", "plan_to_track"]
+__all__ = ["ALL_GUESSES", "Backoff", "Optimum", "find_optimum", "plan_to_track"]
 
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
-FROM_BATCH = -2
-"""The `guess` of an optimum that `batched.find_optima` found."""
 _NO_CHEAPER = 1e-6  # relative
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
@@ -45,9 +43,7 @@ class Optimum(Moving):
     | `status` | "optimal" if the solver converged, else "feasible": it obeys every constraint, but may not be the cheapest |
     | `solver_status` | the solver's own word |
     | `violation` | largest amount by which a constraint is missed, SI units |
-    | `guess` | index of the guessed path that led to it, `FROM_RIGHTING` or `FROM_BATCH` |
     | `seconds` | wall time of the whole search |
-    | `solver_seconds`, `setup_seconds` | the parts of it in solvers, and on differentiating and compiling |
     | `costates` | (n, 8) slopes of the remaining cost with respect to x_1 … x_n; 0 for a simulated episode |
     | `markers` | what the task draws |
     """
@@ -59,10 +55,7 @@ class Optimum(Moving):
     violation: float
     iterations: int
     solver: str
-    guess: int
     seconds: float
-    solver_seconds: float
-    setup_seconds: float
     costates: np.ndarray
     markers: tuple[Marker, ...] = ()
 
@@ -84,7 +77,7 @@ def find_optimum(
     guesses: int = _CONSIDERED,
     paths: list[np.ndarray] | None = None,
     start: float = 0.0,
-    twice: bool | batched.BatchOptima = False,
+    twice: bool = False,
 ) -> Optimum:
     """The cheapest episode from state x0 with constants c.
 
@@ -98,8 +91,8 @@ def find_optimum(
             those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
         paths: ground paths to start from instead of the task's, (n+1, 2) each, m, one point for each control step.
         start: the episode's time at x0, s: the trajectory's times begin there. It matters to tasks with a clock.
-        twice: whether `batched.find_optima` searches too, where it can, or what it found for this episode. It starts from
-            other guesses, and finds something cheaper in about one episode of a hundred.
+        twice: whether `batched.find_optima` searches too, where it can. It starts from other guesses, and finds something
+            cheaper in about one episode of a hundred.
 
     Returns:
         The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
@@ -111,60 +104,45 @@ def find_optimum(
     task, params = make_task(task, params), checked_robot(params)
     x0, c = finite_array(x0, (params.state_size,), "x0"), finite_array(c, (len(task.constant_names),), "c")
     episode = Shooting(task, params, x0, c, backoff, start)
-    started, before = time.perf_counter(), (spent.solving, spent.setup)
-    tried: list[Found] = []
+    started = time.perf_counter()
+    tried: list[OcpSolution] = []
     for found in attempts(episode, guesses, paths):
         tried += found
-        if any(solution.is_optimal for _, solution in found):
+        if any(solution.is_optimal for solution in found):
             break
-    if twice:
-        at_once = second_search(task, params, x0[None], c[None], backoff) if twice is True else twice
-        tried += _cheaper(episode, at_once, min((s.cost for _, s in tried if s.is_optimal), default=math.inf))
-    within = [t for t in tried if t[1].is_within_limits]
+    if twice and batched.solves(task, params):
+        tried += _cheaper(episode, min((s.cost for s in tried if s.is_optimal), default=math.inf))
+    within = [solution for solution in tried if solution.is_within_limits]
     # optima come before feasible episodes, and cheap ones before expensive ones
-    best = min(within, key=lambda t: (not t[1].success, t[1].cost), default=None)
+    best = min(within, key=lambda solution: (not solution.success, solution.cost), default=None)
     if best is None:
-        tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for _, s in tried)
+        tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for s in tried)
         raise PlanError(
             f"{task.id}: no feasible episode from x = {episode.x0.tolist()}, c = {episode.c.tolist()} ({tries})"
         )
-    index, solution = best
+    t = start + task.control_dt * np.arange(len(best.states))
     return Optimum(
-        cost=solution.cost,
-        trajectory=Trajectory(
-            start + task.control_dt * np.arange(len(solution.states)),
-            solution.states,
-            params.force_limit * solution.inputs,
-        ),
-        status="optimal" if solution.is_optimal else "feasible",
-        solver_status=solution.status,
-        violation=solution.violation,
-        iterations=solution.iterations,
-        solver=solution.solver,
-        guess=index,
+        cost=best.cost,
+        trajectory=Trajectory(t, best.states, params.force_limit * best.inputs),
+        status="optimal" if best.is_optimal else "feasible",
+        solver_status=best.status,
+        violation=best.violation,
+        iterations=best.iterations,
+        solver=best.solver,
         seconds=time.perf_counter() - started,
-        solver_seconds=spent.solving - before[0],
-        setup_seconds=spent.setup - before[1],
-        costates=solution.costates,
+        costates=best.costates,
         markers=tuple(task.markers(c)),
     )
 
 
-def second_search(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff = Backoff()
-) -> batched.BatchOptima | None:
-    """What `batched.find_optima` finds for B episodes, or None where it cannot search."""
-    return batched.find_optima(task, params, x0, c, backoff=backoff) if batched.solves(task, params) else None
-
-
-def _cheaper(episode: Shooting, found: batched.BatchOptima | None, cost: float) -> list[Found]:
-    """Solutions from what was found at once for an episode, if that is cheaper."""
-    if found is None or not found.solved[0] or found.costs[0] > cost * (1 - _NO_CHEAPER):
+def _cheaper(episode: Shooting, cost: float) -> list[OcpSolution]:
+    """Solutions from what `batched.find_optima` finds, if that is cheaper."""
+    task, params = episode.task, episode.params
+    found = batched.find_optima(task, params, episode.x0[None], episode.c[None], episode.backoff)
+    if not found.solved[0] or found.costs[0] > cost * (1 - _NO_CHEAPER):
         return []
     x, u = found.states[0, : found.steps[0] + 1], found.forces[0, : found.steps[0]]
-    return [
-        (FROM_BATCH, solution) for solution in episode.solve_to_the_end(x, u / episode.params.force_limit, near=True)
-    ]
+    return episode.solve_to_the_end(x, u / params.force_limit, near=True)
 
 
 def plan_to_track(

@@ -18,9 +18,6 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, then_stay
 from ballbot_gym.tasks import Task
 
-FROM_RIGHTING = -1
-"""The `guess` of an optimum that was found from a simulated recovery."""
-
 ALL_GUESSES = 2**10
 """`guesses` that make `find_optimum` solve every guess."""
 
@@ -39,11 +36,8 @@ _GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip
 GRIPPING_DOUBT = 0.02  # for such robots in place of `SIDE_DOUBT` and `_GRID_DOUBT`, because predictions ignore friction
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 
-Found = tuple[int, OcpSolution]
-"""The index of a guess, and the solution that it led to."""
 
-
-def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[Found]]:
+def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[OcpSolution]]:
     """Every solution found, one kind of guess after the other. The first kind that leads to an optimum suffices.
 
     Args:
@@ -70,13 +64,13 @@ def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) ->
         yield _from_paths(episode, paths)
 
 
-def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[Found]:
+def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[OcpSolution]:
     """With fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
-    return [(0, episode.solve(*episode.along(path), barrier=barrier, iterations=_QUICK_ITERATIONS))]
+    return [episode.solve(*episode.along(path), barrier=barrier, iterations=_QUICK_ITERATIONS)]
 
 
-def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
-    """Every solution found, with the index of the path it came from.
+def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[OcpSolution]:
+    """Every solution found.
 
     Paths of first-exit tasks are first solved with a free interval length, which gives their costs and their times of
     arrival. The best are then solved again for whole numbers of control steps near those times. Several paths of another task
@@ -86,25 +80,25 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
     task = episode.task
     if task.first_exit:
         tried = []
-        for i, path in enumerate(paths):
+        for path in paths:
             h = (len(path) - 1) * task.control_dt / FREE_TIME_INTERVALS
-            tried.append((i, episode.relaxed(*episode.along(guess.resampled(path, FREE_TIME_INTERVALS), h), h)))
-        found = [t for t in tried if not t[1].is_optimal]
-        for i, relaxed in _distinct([t for t in tried if t[1].is_optimal], BASIN_DOUBT):
-            found += [(i, solution) for solution in episode.in_whole_steps(relaxed)]
+            tried.append(episode.relaxed(*episode.along(guess.resampled(path, FREE_TIME_INTERVALS), h), h))
+        found = [solution for solution in tried if not solution.is_optimal]
+        for relaxed in _distinct([solution for solution in tried if solution.is_optimal], BASIN_DOUBT):
+            found += episode.in_whole_steps(relaxed)
         return found
     if len(paths) == 1 or task.steps % COARSE:
         return _refined(episode, [], BASIN_DOUBT, paths)
     starts = [episode.along(path) for path in paths]
-    coarse = [(i, episode.solve(x[::COARSE], a[::COARSE], COARSE)) for i, (x, a) in enumerate(starts)]
-    return _refined(episode, [t for t in coarse if t[1].is_optimal], BASIN_DOUBT, paths)
+    coarse = [episode.solve(x[::COARSE], a[::COARSE], COARSE) for x, a in starts]
+    return _refined(episode, [solution for solution in coarse if solution.is_optimal], BASIN_DOUBT, paths)
 
 
-def _refined(episode: Shooting, coarse: list[Found], doubt: float, paths: list[np.ndarray]) -> list[Found]:
+def _refined(episode: Shooting, coarse: list[OcpSolution], doubt: float, paths: list[np.ndarray]) -> list[OcpSolution]:
     """Solves from the coarse solutions within a relative `doubt` of the best; along the paths, if there are none."""
-    near = [(i, _on_grid(solution, episode.task.steps)) for i, solution in _distinct(coarse, doubt)]
-    starts = near or [(i, episode.along(path)) for i, path in enumerate(paths)]
-    return [(i, s) for i, (x, a) in starts for s in episode.solve_to_the_end(x, a, near=bool(near))]
+    near = [_on_grid(solution, episode.task.steps) for solution in _distinct(coarse, doubt)]
+    starts = near or map(episode.along, paths)
+    return [solution for x, a in starts for solution in episode.solve_to_the_end(x, a, near=bool(near))]
 
 
 def _on_grid(solution: OcpSolution, steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -112,38 +106,37 @@ def _on_grid(solution: OcpSolution, steps: int) -> tuple[np.ndarray, np.ndarray]
     return guess.resampled(solution.states, steps), np.repeat(solution.inputs, steps // len(solution.inputs), axis=0)
 
 
-def _distinct(solved: list[Found], doubt: float) -> list[Found]:
+def _distinct(solved: list[OcpSolution], doubt: float) -> list[OcpSolution]:
     """The solutions within a relative `doubt` of the best, sorted by cost, without repetitions."""
-    kept: list[Found] = []
-    for index, solution in sorted(solved, key=lambda pair: pair[1].cost):
-        contends = not kept or solution.cost < kept[0][1].cost * (1 + doubt)
-        if contends and not any(math.isclose(solution.cost, k.cost, rel_tol=1e-5) for _, k in kept):
-            kept.append((index, solution))
+    kept: list[OcpSolution] = []
+    for solution in sorted(solved, key=lambda each: each.cost):
+        contends = not kept or solution.cost < kept[0].cost * (1 + doubt)
+        if contends and not any(math.isclose(solution.cost, other.cost, rel_tol=1e-5) for other in kept):
+            kept.append(solution)
     return kept
 
 
 # --- simulated recoveries ---
 
 
-def _from_righting(episode: Shooting) -> list[Found]:
+def _from_righting(episode: Shooting) -> list[OcpSolution]:
     """Solutions from simulated recoveries, to either side of the fall; and those recoveries that are episodes themselves.
 
     The recovery within the plane of the fall is tried last, because it may lead to a saddle point.
     """
     task, params, c, limit = episode.task, episode.params, episode.c, episode.params.force_limit
-    found: list[Found] = []
+    found: list[OcpSolution] = []
     for member in righting.righted(task, params, episode.x0, c, (1 - episode.backoff.force) * limit, episode.start):
         if not task.first_exit and len(member.u) == task.steps:
-            found.append((FROM_RIGHTING, _simulated(episode, member)))
-        if member.side == 0 and any(solution.is_optimal for _, solution in found):
+            found.append(_simulated(episode, member))
+        if member.side == 0 and any(solution.is_optimal for solution in found):
             break
         for x, u in righting.guesses(task, params, member, c):
             if task.first_exit:
                 relaxed = episode.relaxed(x, u / limit, task.control_dt)
-                solved = episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
+                found += episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
             else:
-                solved = [episode.solve(x, u / limit)]
-            found += [(FROM_RIGHTING, solution) for solution in solved]
+                found.append(episode.solve(x, u / limit))
     return found
 
 
@@ -170,7 +163,9 @@ def _simulated(episode: Shooting, member: righting.Member) -> OcpSolution:
 # --- the sides of a slalom ---
 
 
-def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, obstacles: np.ndarray) -> list[Found]:
+def _from_likely_sides(
+    episode: Shooting, paths: list[np.ndarray], most: int, obstacles: np.ndarray
+) -> list[OcpSolution]:
     """As `_from_paths`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
 
     The motion without obstacles comes first: it takes few iterations, and it predicts what every choice costs, and how the
@@ -197,27 +192,29 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
     row_of = [rows[side_choice(path, obstacles)] for path in paths]
     predicted, across = free.cost + prediction.costs[0, row_of], prediction.y(0)[row_of]
-    solved: list[Found] = []
+    solved: list[OcpSolution] = []
+    least = math.inf  # that was predicted of a choice that is solved
     for i in np.argsort(predicted, kind="stable")[:most].tolist():
-        if solved and predicted[i] > predicted[solved[0][0]] * (1 + side_doubt):
+        if predicted[i] > least * (1 + side_doubt):
             break
         motion = np.column_stack([motion[:, 0], across[i]])
         for start, barrier in ((motion, NEAR_BARRIER), (motion, BARRIER), (paths[i], BARRIER)):
             solution = solved_from(start, barrier)
             if solution.success:
-                solved.append((i, solution))
+                solved.append(solution)
+                least = min(least, predicted[i])
                 break
     if coarsest > COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
         solved = _on_coarse_grid(episode, _distinct(solved, _COARSEST_DOUBT)) or solved
     return _refined(episode, solved, grid_doubt, paths[:most])
 
 
-def _on_coarse_grid(episode: Shooting, solved: list[Found]) -> list[Found]:
+def _on_coarse_grid(episode: Shooting, solved: list[OcpSolution]) -> list[OcpSolution]:
     """Solutions with forces held for `COARSE` control steps, from those on the coarsest grid."""
     n = episode.task.steps // COARSE
     rough = {"barrier": NEAR_BARRIER, "iterations": _QUICK_ITERATIONS, "tolerance": _ROUGH}
-    found = [(i, episode.solve(*_on_grid(solution, n), COARSE, **rough)) for i, solution in solved]
-    return [(i, solution) for i, solution in found if solution.success]
+    found = [episode.solve(*_on_grid(solution, n), COARSE, **rough) for solution in solved]
+    return [solution for solution in found if solution.success]
 
 
 def straight_path(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
