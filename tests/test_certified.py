@@ -51,9 +51,8 @@ def test_set_has_200_episodes_and_20_trajectories(evaluation):
 
 
 def test_episodes_are_the_tasks_own_and_all_different(task, evaluation, params):
-    certify = pytest.importorskip("ballbot_baselines.certification")
     for i in (0, 1, 199):  # a start that has no optimum is drawn again
-        drawn = (np.concatenate(certify.episode(task, params, i, draw)) for draw in range(20))
+        drawn = (np.concatenate(certified.cache.episode(task, params, i, draw)) for draw in range(20))
         start = np.concatenate([evaluation.states[i], evaluation.constants[i]])
         assert any(np.array_equal(start, each) for each in drawn)
     assert len({(*x, *c) for x, c in zip(evaluation.states, evaluation.constants, strict=True)}) == 200

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from ballbot_baselines import guess, righting, search, sides
-from ballbot_baselines.ilqr import MARGIN, Options, Rows, Solutions, ilqr
+from ballbot_baselines.ilqr import MARGIN, Guesses, Options, Rows, Solutions, ilqr
 from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
@@ -35,10 +35,10 @@ _SIDEWAYS_FAMILY = tuple(itertools.product((7.0, 10.0, 14.0), (1.0, 1.8), (-0.6,
 # Tries in turn from guesses that are motions, and from those that are none. Small multipliers suit limits that are far away.
 _MOTION = tuple(Options(bends=0, width=width, multiplier=1e-3) for width in (0.2, 0.02))
 _PATH = tuple(Options(bends=bends, width=width, multiplier=1e-2) for bends, width in ((3, 0.2), (6, 0.2), (1, 0.05)))
-_GOAL = tuple(replace(options, multiplier=0.1) for options in _PATH)
+_GOAL = tuple(options._replace(multiplier=0.1) for options in _PATH)
 _NEAR_GOAL = (Options(bends=3, width=0.005, multiplier=0.01), *_GOAL)  # where the goal's multipliers are about right
 _ROUGH_PATH, _ROUGH_GOAL = (
-    tuple(replace(options, tolerance=1e-4, violation=1e-3) for options in tries) for tries in (_PATH, _GOAL)
+    tuple(options._replace(tolerance=1e-4, violation=1e-3) for options in tries) for tries in (_PATH, _GOAL)
 )
 # Greater multipliers and narrow prices at first keep a motion on its side of the obstacles.
 _SIDES = tuple(
@@ -150,16 +150,6 @@ def find_optima(
     return optima
 
 
-@dataclass(frozen=True)
-class _Guesses(Rows):
-    """J guesses: of which episodes, states (J, n+1, 8 or 9), actions (J, n, 2), and numbers of steps (J,)."""
-
-    of: np.ndarray
-    x: np.ndarray
-    a: np.ndarray
-    steps: np.ndarray
-
-
 class _Batch:
     """The search of some episodes, which fills in their `BatchOptima`."""
 
@@ -203,14 +193,17 @@ class _Batch:
         rows = np.tile(given, (len(c), 1))
         first = len(robot_numbers(self._params))
         rows[:, first : first + c.shape[1]] = c
-        if free_time or self._solver.rest is None:
+        if free_time:
+            bounds = self._task.control_dt / 4, self._task.duration / FREE_TIME_INTERVALS
+            return np.column_stack([rows, np.tile(bounds, (len(c), 1))])
+        if self._solver.rest is None:
             return rows
         of_rest = [*self._solver.rest.p[np.triu_indices(8)], float(steps < self._task.steps)]
         return np.column_stack([rows, self._ends[of], np.tile(of_rest, (len(c), 1))])
 
     def _solve(
         self,
-        guesses: _Guesses,
+        guesses: Guesses,
         tries: Sequence[Options],
         coarseness: int = 1,
         c: np.ndarray | None = None,
@@ -222,26 +215,21 @@ class _Batch:
 
         They may start from multipliers (J, ne) of the end.
         """
-        task, n = self._task, guesses.a.shape[1]
-        solver, lengths = (
-            (ilqr(task, self._params, True), 1.0) if free_time else (self._solver, coarseness * task.control_dt)
-        )
-        given = self._given(guesses.of, coarseness * n, c, free_time)
+        solver, length = self._solver, coarseness * self._task.control_dt
         if free_time:
-            bounds = task.control_dt / 4, task.duration / n
-            given = np.column_stack([given, np.tile(bounds, (len(given), 1))])
-
+            solver, length = ilqr(self._task, self._params, True), 1.0
+        given = self._given(guesses.of, coarseness * guesses.a.shape[1], c, free_time)
         found, left, waiting = None, np.arange(len(guesses.of)), tries
         while waiting and len(left):
             # few that are left would not fill the processor's lanes
             now, waiting = (waiting, ()) if len(left) * len(waiting) <= _FEW else (waiting[:1], waiting[1:])
             rows = np.tile(left, len(now))
-            some, options = guesses.some(rows), [tried for tried in now for _ in left]
+            options = [tried for tried in now for _ in left]
             ends = None if end_multipliers is None else end_multipliers[rows]
-            again = solver.solve(some.x, some.a, some.steps, lengths, given[rows], options, end_multipliers=ends)
+            again = solver.solve(guesses.some(rows), length, given[rows], options, end_multipliers=ends)
             right = again.solved
             if chosen_sides is not None:
-                right = right & (self._sides(some.of, again.x) == chosen_sides[rows]).all(axis=1)
+                right = right & (self._sides(again.of, again.x) == chosen_sides[rows]).all(axis=1)
             if found is None and len(now) == 1:  # all of them, so nothing is to be copied
                 found = again
             else:
@@ -262,7 +250,7 @@ class _Batch:
         return found
 
     def _keep(
-        self, guesses: _Guesses, tries: Sequence[Options], end_multipliers: np.ndarray | None = None
+        self, guesses: Guesses, tries: Sequence[Options], end_multipliers: np.ndarray | None = None
     ) -> np.ndarray:
         """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,).
 
@@ -271,21 +259,21 @@ class _Batch:
         """
         if not len(guesses.of):
             return np.zeros(0)
-        return self._kept(guesses, self._solve(guesses, tries, end_multipliers=end_multipliers))
+        return self._kept(self._solve(guesses, tries, end_multipliers=end_multipliers))
 
-    def _kept(self, guesses: _Guesses, found: Solutions) -> np.ndarray:
-        if self._solver.rest is not None and guesses.a.shape[1] < self._task.steps:
-            guesses, found = self._to_the_end(guesses, found)
+    def _kept(self, found: Solutions) -> np.ndarray:
+        if self._solver.rest is not None and found.a.shape[1] < self._task.steps:
+            found = self._to_the_end(found)
             again = np.flatnonzero(~found.solved & np.isfinite(found.costs))
-            found.costs[again] = self._keep(guesses.some(again), _MOTION)
-        self._write(guesses, found)
+            found.costs[again] = self._keep(found.some(again), _MOTION)
+        self._write(found)
         return found.costs
 
-    def _write(self, guesses: _Guesses, found: Solutions) -> None:
+    def _write(self, found: Solutions) -> None:
         """Keeps the cheapest solution of every episode."""
         optima, limit = self._optima, self._params.force_limit
         for i in np.argsort(-found.costs, kind="stable"):  # the cheapest last
-            row, steps = guesses.of[i], guesses.steps[i]
+            row, steps = found.of[i], found.steps[i]
             if not found.solved[i] or found.costs[i] >= optima.costs[row]:
                 continue
             optima.costs[row], optima.steps[row] = found.costs[i], steps
@@ -297,17 +285,17 @@ class _Batch:
             ):
                 kept[row, :steps], kept[row, steps:] = unit * values[i, :steps], 0
 
-    def _to_the_end(self, guesses: _Guesses, found: Solutions) -> tuple[_Guesses, Solutions]:
+    def _to_the_end(self, found: Solutions) -> Solutions:
         """Whole episodes, of solutions of their first seconds and LQR then: solved where LQR's cost-to-go was right."""
-        rest, ends, limit = self._solver.rest, self._ends[guesses.of], self._params.force_limit
+        rest, ends, limit = self._solver.rest, self._ends[found.of], self._params.force_limit
         assert rest is not None
-        left = self._task.steps - guesses.a.shape[1]
-        last = found.x[:, -1]
-        given, none = self._given(guesses.of, self._task.steps), np.zeros((len(last), left, 2))
-        x, a, costs = self._solver.simulate(last, self._task.control_dt, given, none, ends=ends)
+        left, last = self._task.steps - found.a.shape[1], found.x[:, -1]
+        given = self._given(found.of, self._task.steps)
+        x, a, costs = self._solver.simulate(last, left, self._task.control_dt, given, ends=ends)
         expected = rest.costs(last - ends)
         whole = replace(
             found,
+            steps=found.steps + left,
             x=np.concatenate([found.x, x[:, 1:]], axis=1),
             a=np.concatenate([found.a, a], axis=1),
             gains=np.concatenate([found.gains, np.broadcast_to(rest.gain / limit, (len(a), left, 2, 8))], axis=1),
@@ -315,9 +303,9 @@ class _Batch:
             costs=found.costs - expected + costs,
         )
         whole.solved[:] &= np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
-        return _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left), whole
+        return whole
 
-    def _recoveries(self) -> _Guesses:
+    def _recoveries(self) -> Guesses:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
         task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
         n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
@@ -333,25 +321,20 @@ class _Batch:
             for bandwidth, seconds, lean, fade in family if len(rows) else ():
                 path[..., 2:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
                 states, actions, costs = self._solver.simulate(
-                    x0[rows],
-                    task.control_dt,
-                    given[rows],
-                    np.zeros((len(rows), n, 2)),
-                    path[rows],
-                    (bandwidth, seconds),
+                    x0[rows], n, task.control_dt, given[rows], path[rows], (bandwidth, seconds)
                 )
                 if rest is not None and n < task.steps:
                     costs = costs + rest.costs(states[:, -1] - self._ends[rows])
                 cheaper = costs < best[rows]
                 for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
                     kept[rows[cheaper]] = values[cheaper]
-        return _Guesses(np.arange(count), x, a, np.full(count, n)).some(np.isfinite(best))
+        return Guesses(np.arange(count), np.full(count, n), x, a).some(np.isfinite(best))
 
-    def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> _Guesses:
+    def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> Guesses:
         """Guesses along ground paths (steps+1, 2) of the same number of steps."""
         x, a = self._motion(np.array(paths), self._task.control_dt, self._x0[of])
         a = a[:, ::coarseness]
-        return _Guesses(np.asarray(of), x[:, ::coarseness], a, np.full(len(a), a.shape[1]))
+        return Guesses(np.asarray(of), np.full(len(a), a.shape[1]), x[:, ::coarseness], a)
 
     def _motion(self, path: np.ndarray, length: float | np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, u = guess.along_path(self._params, path, length, start=x0)
@@ -374,7 +357,7 @@ class _Batch:
         chosen = np.arange(len(of))
         if len(of) > len(rows) and self._task.steps % search.COARSE == 0:
             found = self._solve(self._along(of, paths, search.COARSE), _ROUGH_PATH, search.COARSE)
-            chosen = _contenders(np.array(of), found, search.BASIN_DOUBT)
+            chosen = _contenders(found, search.BASIN_DOUBT)
         self._keep(self._along([of[i] for i in chosen], [paths[i] for i in chosen]), _PATH)
 
     def _arrive(self) -> None:
@@ -384,9 +367,9 @@ class _Batch:
         lengths = np.array([len(path) - 1 for path in paths]) * task.control_dt / n
         x, a = self._motion(np.array([guess.resampled(path, n) for path in paths]), lengths, self._x0[of])
         x = np.concatenate([x, np.broadcast_to(lengths[:, None, None], (len(of), n + 1, 1))], axis=-1)
-        motions = _Guesses(np.array(of), x, a, np.full(len(of), n))
+        motions = Guesses(np.array(of), np.full(len(of), n), x, a)
         relaxed = self._solve(motions, _ROUGH_GOAL, free_time=True)
-        chosen = _contenders(np.array(of), relaxed, search.BASIN_DOUBT)
+        chosen = _contenders(relaxed, search.BASIN_DOUBT)
         arrivals = np.ceil(relaxed.x[chosen, 0, 8] * n / task.control_dt).astype(int)
         tried: dict[int, dict[int, float]] = {i: {} for i in chosen.tolist()}  # costs by number of steps
         wanted = [
@@ -402,7 +385,7 @@ class _Batch:
                 x[steps == s, : s + 1] = guess.resampled(relaxed.x[some, :, :8], s)
                 held = np.concatenate([relaxed.a[some], relaxed.a[some, -1:]], axis=1)
                 a[steps == s, :s] = guess.resampled(held, s)[:, :-1]
-            guesses = _Guesses(motions.of[rows], x, a, steps)
+            guesses = Guesses(relaxed.of[rows], steps, x, a)
             found = self._keep(guesses, _NEAR_GOAL, relaxed.end_multipliers[rows])
             for (i, s), cost in zip(wanted, found.tolist(), strict=True):
                 tried[i][s] = cost
@@ -452,45 +435,38 @@ class _Batch:
         ]
         along, wanted = self._along(of, paths, coarse), self._sides(of, paths)
         rough = self._solve(along, _SIDES, coarse, chosen_sides=wanted)
-        chosen = _contenders(along.of, rough, _SIDES_DOUBT)
+        chosen = _contenders(rough, _SIDES_DOUBT)
         if not len(chosen):
             return
         x = np.array([guess.resampled(states, steps) for states in rough.x[chosen]])
         a = np.repeat(rough.a[chosen], coarse, axis=1)
-        near = _Guesses(along.of[chosen], x, a, np.full(len(chosen), steps))
+        near = Guesses(rough.of[chosen], np.full(len(chosen), steps), x, a)
         found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=wanted[chosen])
-        self._pass_later(near, found)
-        left = chosen[np.isinf(self._kept(near, found))]
+        self._pass_later(found)
+        left = chosen[np.isinf(self._kept(found))]
         if len(left):
             self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
 
-    def _pass_later(self, guesses: _Guesses, found: Solutions) -> None:
+    def _pass_later(self, found: Solutions) -> None:
         """Replaces the best solution of every episode by one that passes the obstacles a control step later or earlier, where
         that is cheaper.
 
         A robot cuts corners between its control steps. So wherever an apex lies between two of them is a local optimum.
         """
-        of = guesses.of[np.isfinite(found.costs)]
+        of = found.of[np.isfinite(found.costs)]
         if not len(of):
             return
-        rows = np.array([np.where(guesses.of == i, found.costs, np.inf).argmin() for i in np.unique(of)])
+        rows = np.array([np.where(found.of == i, found.costs, np.inf).argmin() for i in np.unique(of)])
         two = np.tile(rows, 2)
         x, a, multipliers = (
             np.concatenate([_shifted(part[rows], 1), _shifted(part[rows], -1)])
             for part in (found.x, found.a, found.multipliers)
         )
         x[:, 0] = found.x[two, 0]
-        given = self._given(guesses.of[two], a.shape[1])
-        moved = self._solver.solve(
-            x,
-            a,
-            guesses.steps[two],
-            self._task.control_dt,
-            given,
-            _SHIFTED,
-            np.maximum(multipliers, _SHIFTED.multiplier),
-            found.end_multipliers[two],
-        )
+        multipliers = np.maximum(multipliers, _SHIFTED.multiplier)
+        guesses = Guesses(found.of[two], found.steps[two], x, a)
+        given, ends = self._given(guesses.of, a.shape[1]), found.end_multipliers[two]
+        moved = self._solver.solve(guesses, self._task.control_dt, given, _SHIFTED, multipliers, ends)
         moved.costs[~moved.solved] = np.inf
         earlier = moved.costs[len(rows) :] < moved.costs[: len(rows)]
         best = np.arange(len(rows)) + len(rows) * earlier
@@ -503,11 +479,11 @@ def _shifted(values: np.ndarray, later: int) -> np.ndarray:
     return values[:, np.clip(np.arange(n) - later, 0, n - 1)]
 
 
-def _contenders(of: np.ndarray, found: Solutions, doubt: float) -> np.ndarray:
+def _contenders(found: Solutions, doubt: float) -> np.ndarray:
     """Which of J solutions are within a relative doubt of the cheapest of their episode, without repetitions."""
     kept: dict[int, list[int]] = {}
     for i in np.argsort(found.costs, kind="stable").tolist():
-        others = kept.setdefault(int(of[i]), [])
+        others = kept.setdefault(int(found.of[i]), [])
         if not math.isfinite(found.costs[i]) or (others and found.costs[i] > found.costs[others[0]] * (1 + doubt)):
             continue
         if all(np.abs(found.x[i, :, :2] - found.x[j, :, :2]).max() > _SAME for j in others):

@@ -15,9 +15,9 @@ Where a task ends at rest, LQR's cost-to-go can stand for the end of an episode.
 import ctypes
 import functools
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import casadi
 import numpy as np
@@ -30,21 +30,17 @@ from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
-OPTIMAL = 0
-"""The status of a solution that met the tolerances; every other one did not."""
 MARGIN = 2e-5
 """By how much constraints are kept, so that they hold where a solution misses one by `Options.violation`."""
 
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
 _LEAST_CURVATURE = 1e-9  # of the cost along an action, so that steps of no length have a best one
 _LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
-_ALIKE = 20  # problems whose numbers of steps share a multiple of these are solved together
 _REST = 8 + 36 + 1  # parameters of LQR's cost-to-go: a state, the upper triangle of P, and its share
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(NamedTuple):
     """Of the solver, in ilqr.c's order, the multiplier last."""
 
     width: float = 0.2
@@ -71,23 +67,37 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Solutions(Rows):
+class Guesses(Rows):
     """Of J problems of at most n steps; those with fewer have no meaning at the end.
 
     | field | shape | meaning |
     |---|---|---|
+    | of | (J,) | episodes that they are motions of |
+    | steps | (J,) | n at most |
     | x | (J, n+1, ns) | states; ns is 9 with the length of a step, s, where that is free |
     | a | (J, n, 2) | actions |
+    """
+
+    of: np.ndarray
+    steps: np.ndarray
+    x: np.ndarray
+    a: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solutions(Guesses):
+    """What guesses led to.
+
+    | field | shape | meaning |
+    |---|---|---|
     | gains | (J, n, 2, ns) | K of the feedback a − K (x' − x) |
     | slopes | (J, n, ns) | of the remaining cost with respect to each state but the last |
     | costs | (J,) | |
-    | solved | (J,) bool | |
+    | solved | (J,) bool | the tolerances are met |
     | multipliers | (J, n, np) | of the constraints of each step |
     | end_multipliers | (J, ne) | of those of the last state |
     """
 
-    x: np.ndarray
-    a: np.ndarray
     gains: np.ndarray
     slopes: np.ndarray
     costs: np.ndarray
@@ -147,71 +157,60 @@ class Ilqr:
         library, self._sizes = _compiled(*kind, free_time, self.rest is not None)
         self.states = self._sizes["STATES"]
         self._solve, self._follow = library.solve, library.follow
-        count, pointer = ctypes.c_int64, ctypes.c_void_p
-        self._solve.argtypes, self._solve.restype = [count, count, count, *[pointer] * 13], None
-        self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 9], None
+        of_all = [ctypes.c_int64, ctypes.c_int64, ctypes.c_double]
+        self._solve.argtypes, self._solve.restype = [*of_all, *[ctypes.c_void_p] * 11], None
+        self._follow.argtypes, self._follow.restype = [*of_all, *[ctypes.c_void_p] * 8], None
 
     def solve(
         self,
-        x: np.ndarray,
-        a: np.ndarray,
-        steps: Any,
-        lengths: Any,
+        guesses: Guesses,
+        length: float,
         given: np.ndarray,
-        options: Options | Sequence[Options] = Options(),
+        options: Options | Sequence[Options],
         multipliers: np.ndarray | None = None,
         end_multipliers: np.ndarray | None = None,
     ) -> Solutions:
-        """Solves J problems from guesses.
+        """Solves J problems.
 
         Args:
-            x: (J, n+1, ns) states.
-            a: (J, n, 2) actions.
-            steps: (J,) or one number of steps, n at most.
-            lengths: (J,) or one length of a step, s; 1 where it is free.
+            guesses: of the solutions.
+            length: of a step, s; 1 where it is free.
             given: (J, np) parameters: p of `ocp_of` but the first, and the bounds of a free length, s, or else, for
                 tasks with a `rest`, a state (8,), P's upper triangle (36,), and the share of LQR's cost-to-go that counts.
             options: of the solver, or of each problem.
             multipliers, end_multipliers: (J, n, path constraints) and (J, constraints of the end) at first, of a solution of
                 nearly the same problem; default, the option.
         """
-        jobs, n = a.shape[:2]
-        x, a = np.array(x, np.float64, order="C"), np.array(a, np.float64, order="C")
-        steps = np.array(np.broadcast_to(steps, jobs), np.int64)
-        lengths, given = self._given(jobs, lengths, given)
-        each = [options] * jobs if isinstance(options, Options) else options
-        numbers = {one: astuple(one) for one in set(each)}
-        settings = np.array([numbers[one] for one in each], np.float64).reshape(jobs, len(fields(Options)))
+        jobs, n = guesses.a.shape[:2]
+        x, a = np.array(guesses.x, np.float64, order="C"), np.array(guesses.a, np.float64, order="C")
+        steps, given = np.array(guesses.steps, np.int64), np.ascontiguousarray(given)
+        settings = np.array(np.broadcast_to(options, (jobs, len(Options._fields))), np.float64, order="C")
         m, e = np.zeros((jobs, n, self._sizes["PATH"])), np.zeros((jobs, self._sizes["END"]))
         m[:] = settings[:, -1:, None] if multipliers is None else multipliers
         e[:] = settings[:, -1:] if end_multipliers is None else end_multipliers
         gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
-        costs, status = np.zeros(jobs), np.zeros(jobs, np.int64)
-        arrays = (settings, steps, lengths, given, x, a, m, e, gains, slopes, costs, status)
-        alike = -(-steps // _ALIKE)
-        for group in np.unique(alike):
-            rows = np.flatnonzero(alike == group)
-            longest = min(n, int(group) * _ALIKE)
-            self._solve(len(rows), longest, n, *(array.ctypes.data for array in (rows, *arrays)))
-        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, m, e)
+        costs, solved = np.zeros(jobs), np.zeros(jobs, np.int64)
+        arrays = (settings, steps, given, x, a, m, e, gains, slopes, costs, solved)
+        self._solve(jobs, n, length, *(array.ctypes.data for array in arrays))
+        return Solutions(guesses.of, steps, x, a, gains, slopes, costs, solved == 1, m, e)
 
     def simulate(
         self,
         x0: np.ndarray,
+        steps: int,
         length: float,
         given: np.ndarray,
-        a: np.ndarray,
         paths: np.ndarray | None = None,
         settings: tuple[float, float] = (0.0, 0.0),
         ends: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulates J episodes under given actions, or under `righting.steering`, or under LQR at the end.
+        """Simulates J episodes under `righting.steering`, or under LQR at the end.
 
         Args:
             x0: (J, 8) initial states.
+            steps: n.
             length: of a step, s.
             given: as of `solve`.
-            a: (J, n, 2) actions; 0 with `paths` or `ends`.
             paths: (J, n, 4) where to steer the ball, m, and leans that are added, rad.
             settings: of this feedback, its bandwidth, rad/s, and its time constant, s.
             ends: (J, 8) states about which LQR acts.
@@ -219,22 +218,16 @@ class Ilqr:
         Returns:
             States (J, n+1, 8), actions (J, n, 2), and costs (J,), which are infinite where a margin is violated.
         """
-        jobs, n = a.shape[:2]
-        a, x = np.array(a, np.float64, order="C"), np.zeros((jobs, n + 1, self.states))
-        costs, missed, feedback = np.zeros(jobs), np.zeros(jobs), None
-        x[:, 0] = x0
+        jobs = len(x0)
+        x, a, costs, missed = (np.zeros((jobs, *shape)) for shape in ((steps + 1, self.states), (steps, 2), (), ()))
+        x[:, 0], feedback = x0, None
         if ends is not None:
             assert self.rest is not None
             feedback = np.column_stack([np.tile(self.rest.gain.ravel() / self._limit, (jobs, 1)), ends])
-        paths = None if paths is None else np.ascontiguousarray(paths)
-        arrays = *self._given(jobs, length, given), paths, np.tile(settings, (jobs, 1)), feedback, x, a, costs, missed
-        self._follow(jobs, n, *(None if array is None else array.ctypes.data for array in arrays))
+        arrays = given, paths, np.array(settings), feedback, x, a, costs, missed
+        kept = [None if array is None else np.ascontiguousarray(array) for array in arrays]
+        self._follow(jobs, steps, length, *(None if array is None else array.ctypes.data for array in kept))
         return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
-
-    def _given(self, jobs: int, lengths: Any, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        shapes = ((lengths, (jobs,)), (given, (jobs, self._sizes["PARAMS"])))
-        lengths, given = (np.ascontiguousarray(np.broadcast_to(part, shape), np.float64) for part, shape in shapes)
-        return lengths, given
 
 
 @functools.lru_cache(maxsize=8)
