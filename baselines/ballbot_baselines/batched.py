@@ -466,7 +466,7 @@ class _Batch:
         multipliers = np.maximum(multipliers, _SHIFTED.multiplier)
         guesses = Guesses(found.of[two], found.steps[two], x, a)
         given, ends = self._given(guesses.of, a.shape[1]), found.end_multipliers[two]
-        moved = self._solver.solve(guesses, self._task.control_dt, given, _SHIFTED, multipliers, ends)
+        moved = self._solver.solve(guesses, self._task.control_dt, given, [_SHIFTED] * len(two), multipliers, ends)
         moved.costs[~moved.solved] = np.inf
         earlier = moved.costs[len(rows) :] < moved.costs[: len(rows)]
         best = np.arange(len(rows)) + len(rows) * earlier

@@ -166,7 +166,7 @@ class Ilqr:
         guesses: Guesses,
         length: float,
         given: np.ndarray,
-        options: Options | Sequence[Options],
+        options: Sequence[Options],
         multipliers: np.ndarray | None = None,
         end_multipliers: np.ndarray | None = None,
     ) -> Solutions:
@@ -177,14 +177,14 @@ class Ilqr:
             length: of a step, s; 1 where it is free.
             given: (J, np) parameters: p of `ocp_of` but the first, and the bounds of a free length, s, or else, for
                 tasks with a `rest`, a state (8,), P's upper triangle (36,), and the share of LQR's cost-to-go that counts.
-            options: of the solver, or of each problem.
+            options: of the solver, for each problem.
             multipliers, end_multipliers: (J, n, path constraints) and (J, constraints of the end) at first, of a solution of
                 nearly the same problem; default, the option.
         """
         jobs, n = guesses.a.shape[:2]
         x, a = np.array(guesses.x, np.float64, order="C"), np.array(guesses.a, np.float64, order="C")
         steps, given = np.array(guesses.steps, np.int64), np.ascontiguousarray(given)
-        settings = np.array(np.broadcast_to(options, (jobs, len(Options._fields))), np.float64, order="C")
+        settings = np.array(options, np.float64)
         m, e = np.zeros((jobs, n, self._sizes["PATH"])), np.zeros((jobs, self._sizes["END"]))
         m[:] = settings[:, -1:, None] if multipliers is None else multipliers
         e[:] = settings[:, -1:] if end_multipliers is None else end_multipliers
