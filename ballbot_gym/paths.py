@@ -1,4 +1,4 @@
-"""Smooth ground paths: cubic Hermite interpolation, and paths that end at rest."""
+"""Smooth ground paths: cubic Hermite interpolation, paths that end at rest, and how they pass obstacles."""
 
 from typing import Any
 
@@ -60,3 +60,9 @@ def then_stay(path: np.ndarray, steps: int) -> np.ndarray:
     """A path (n, 2) extended to (steps+1, 2) by repeating its last point, or cut to that length."""
     rest = np.repeat(path[-1:], max(0, steps + 1 - len(path)), axis=0)
     return np.concatenate([path, rest])[: steps + 1]
+
+
+def sides_passed(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
+    """The sides on which a path (k, at least 2) passes obstacles (n, 3), where it is nearest to their x: 1 left, −1 right."""
+    nearest = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
+    return tuple(1 if path[k, 1] > y else -1 for k, y in zip(nearest, obstacles[:, 1], strict=True))

@@ -15,9 +15,9 @@ import tyro
 from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
 from ballbot_gym import files
 from ballbot_gym.params import default_params
+from ballbot_gym.paths import sides_passed
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.weave import sides_passed
 from ballbot_train import jobs
 
 _DETOURS = 3
@@ -46,7 +46,9 @@ def planned(name: str, seed: int, indices: Sequence[int]) -> Iterator[jobs.Entry
             start = time.process_time()
             before = find_optimum(task, params, x0, c, paths=task.guess_paths(x0, c, params)[:_SHORTEST])
             entry |= {"seconds_before": time.process_time() - start, "cost_before": before.cost}
-            entry["both_sides"] = len(set(sides_passed(optimum.trajectory.x[:, :2], c))) == 2
+            entry["both_sides"] = (
+                len(set(sides_passed(optimum.trajectory.x, np.asarray(task.passed_obstacles(c))))) == 2
+            )
         yield entry
 
 

@@ -18,8 +18,9 @@ from ballbot_baselines import sides
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import files
 from ballbot_gym.params import default_params
+from ballbot_gym.paths import sides_passed
 from ballbot_gym.rollout import PlanError
-from ballbot_gym.tasks.weave import MAX_OBSTACLES, Weave, sides_passed, split_constants
+from ballbot_gym.tasks.weave import MAX_OBSTACLES, Weave, split_constants
 
 TASK, PARAMS = Weave(), default_params()
 Choice = tuple[int, ...]
@@ -39,7 +40,7 @@ def cost_of(x0: np.ndarray, c: np.ndarray, kept: tuple[int, ...], choice: Choice
     except PlanError:
         return np.inf, start
     path = found.trajectory.x[:, :2]
-    passed = sides_passed(path, fewer)
+    passed = sides_passed(path, TASK.passed_obstacles(fewer))
     return (found.cost if found.is_optimal and passed == choice else np.inf), path
 
 

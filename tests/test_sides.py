@@ -8,7 +8,8 @@ pytest.importorskip("casadi")
 from ballbot_baselines import sides
 from ballbot_baselines.optimum import ALL_GUESSES, find_optimum
 from ballbot_gym import certified
-from ballbot_gym.tasks.weave import Weave, sides_passed, split_constants
+from ballbot_gym.paths import sides_passed
+from ballbot_gym.tasks.weave import Weave, split_constants
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
     task, excess = Weave(), []
     for x0, c, path in slaloms:
         found = predicted(task, params, x0, c, path)
-        optimal = (found.sides == sides_passed(path, c)).all(1)
+        optimal = (found.sides == sides_passed(path, task.passed_obstacles(c))).all(1)
         excess.append(float(found.costs[0, optimal][0] - found.costs.min()))
     assert max(excess) < 1.0
     assert np.median(excess) < 0.1
@@ -67,7 +68,7 @@ def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
         free = find_optimum(task, params, x0, task.without_obstacles(c), guesses=1)
         assert free.cost < known.costs[i]
         found = predicted(task, params, x0, c, free.trajectory.x)
-        optimal = (found.sides == sides_passed(known.trajectories[i].x[:, :2], c)).all(1)
+        optimal = (found.sides == sides_passed(known.trajectories[i].x, task.passed_obstacles(c))).all(1)
         doubt.append((found.costs[0, optimal][0] - found.costs.min()) / known.costs[i])
     assert max(doubt) < 0.01
 
@@ -87,5 +88,5 @@ def test_a_choice_on_which_the_solver_fails_is_tried_again(params):
     task = Weave()
     x0, c = task.sample(np.random.default_rng([2026, 1, 156]), params)
     found = find_optimum(task, params, x0, c)
-    assert sides_passed(found.trajectory.x[:, :2], c) == (1, -1, 1, -1)
+    assert sides_passed(found.trajectory.x, task.passed_obstacles(c)) == (1, -1, 1, -1)
     assert found.cost == pytest.approx(75.8071, abs=1e-3)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from ballbot_gym import dynamics
+from ballbot_gym.paths import sides_passed
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.orbit import Orbit, orbit_speed, orbit_tilt, steady_orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
-from ballbot_gym.tasks.weave import Weave, sides_passed, split_constants
+from ballbot_gym.tasks.weave import Weave, split_constants
 
 X = np.array([0.5, -1.5, 0.3, -0.4, 2.0, -3.0, 0.7, -0.8])
 U = np.array([100.0, -200.0])
@@ -306,7 +307,7 @@ def test_guessed_paths_try_every_choice_of_sides_and_one_clears_all_obstacles(pa
         assert len(paths) == 2 ** len(obstacles)
         np.testing.assert_allclose([path[-1] for path in paths], np.tile(goal, (len(paths), 1)), atol=1e-9)
         left = task.routed_path(start, constants, (1,) * len(obstacles))
-        assert sides_passed(left, constants) == (1,) * len(obstacles)
+        assert sides_passed(left, obstacles) == (1,) * len(obstacles)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])

@@ -223,10 +223,3 @@ def split_constants(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     obstacles = np.asarray(c[2:]).reshape(MAX_OBSTACLES, 3)
     distinct = [i for i in range(MAX_OBSTACLES) if i == 0 or not (obstacles[i] == obstacles[i - 1]).all()]
     return np.asarray(c[:2]), obstacles[distinct]
-
-
-def sides_passed(path: np.ndarray, c: np.ndarray) -> tuple[int, ...]:
-    """For each obstacle, 1 if the path (n, 2) passes it on the left (greater y) where it is nearest to it, else −1."""
-    _, obstacles = split_constants(c)
-    nearest = [np.argmin(np.hypot(*(path - obstacle[:2]).T)) for obstacle in obstacles]
-    return tuple(1 if path[k, 1] > o[1] else -1 for k, o in zip(nearest, obstacles, strict=True))

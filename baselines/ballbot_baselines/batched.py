@@ -27,6 +27,7 @@ from ballbot_baselines.ilqr import MARGIN, Guesses, Options, Rows, Solutions, il
 from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.paths import sides_passed
 from ballbot_gym.tasks import Task
 
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
@@ -246,7 +247,7 @@ class _Batch:
         """(J, most obstacles) on which sides ground paths (n, at least 2) pass; 0 where there is no obstacle."""
         found = np.zeros((len(of), max(map(len, self._obstacles))), int)
         for row, (i, path) in enumerate(zip(of, paths, strict=True)):
-            found[row, : len(self._obstacles[i])] = search.side_choice(path, self._obstacles[i])
+            found[row, : len(self._obstacles[i])] = sides_passed(path, self._obstacles[i])
         return found
 
     def _keep(

@@ -60,7 +60,7 @@ def righted(
             force = omni.LEAST_FORCE * force
         if params.grips:
             force = min(force, _GRIPPING * params.friction * params.weight)
-        x, u = simulate(params, x0, gains, target, task.steps, task.control_dt, force)
+        x, u = _simulated(task, params, x0, gains, target, force)
         t = start + task.control_dt * np.arange(len(x))[:, None]
         margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in task.margins(x, task.at(c, t))], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
@@ -99,28 +99,19 @@ def guesses(task: Task, params: BallbotParams, member: Member, c: np.ndarray) ->
     return [(np.concatenate([member.x[:k], x]), np.concatenate([member.u[:k], u]))]
 
 
-def simulate(
-    params: BallbotParams, x0: np.ndarray, gains: np.ndarray, target: np.ndarray, steps: int, dt: float, force: float
+def _simulated(
+    task: Task, params: BallbotParams, x0: np.ndarray, gains: np.ndarray, target: np.ndarray, force: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Runs members of the family.
+    """States (steps+1, n, 8) and forces (steps, n, 2), N, of n members that steer the ball to `target` (2,), m.
 
-    Args:
-        x0: (8,) or (n, 8) initial state.
-        gains: (4, n) of each member: the bandwidth of the lean's loop, rad/s; the time constant of the ball's loop, s; how
-            far it leans to the left of the fall at first, rad; and the time in which that fades, s.
-        target: (2,) where to steer the ball, m.
-        steps: control steps.
-        dt: control step, s.
-        force: largest force per axis, N.
-
-    Returns:
-        States (steps+1, n, 8) and forces (steps, n, 2), N.
+    The gains (4, n) are the bandwidth of the lean's loop, rad/s; the time constant of the ball's loop, s; how far it leans to
+    the left of the fall at first, rad; and the time in which that fades, s.
     """
     bandwidth, seconds, lean, fade = gains
     aside = leaning_aside(x0, lean)
     x = np.array(np.broadcast_to(np.asarray(x0, np.float64), (gains.shape[1], params.state_size)))
-    states, forces = [x], []
-    for k in range(steps):
+    states, forces, dt = [x], [], task.control_dt
+    for k in range(task.steps):
         leaning = aside * np.exp(-k * dt / fade)
         u = np.stack(steering(params, tuple(x.T), leaning, bandwidth, seconds, target, force), -1)
         if params.wheels is not None:

@@ -15,7 +15,7 @@ from ballbot_baselines.ocp import OcpSolution
 from ballbot_baselines.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.paths import cubic, then_stay
+from ballbot_gym.paths import cubic, sides_passed, then_stay
 from ballbot_gym.tasks import Task
 
 ALL_GUESSES = 2**10
@@ -190,7 +190,7 @@ def _from_likely_sides(
     goal_y = task.reference(x0, c, params).x[-1, 1:2]
     prediction = sides.predict(task, params, x0[None], goal_y, motion[None, :, 0], obstacles[None])
     rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
-    row_of = [rows[side_choice(path, obstacles)] for path in paths]
+    row_of = [rows[sides_passed(path, obstacles)] for path in paths]
     predicted, across = free.cost + prediction.costs[0, row_of], prediction.y(0)[row_of]
     solved: list[OcpSolution] = []
     least = math.inf  # that was predicted of a choice that is solved
@@ -222,9 +222,3 @@ def straight_path(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarr
     goal = task.reference(x0, c, params).x[-1, :2]
     steps = min(task.steps, round(_STRAIGHT_SECONDS / task.control_dt))
     return then_stay(cubic(x0[:2], x0[4:6], goal, np.zeros(2), steps, task.control_dt), task.steps)
-
-
-def side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
-    """The sides on which a path (k, at least 2) passes obstacles (n, 3), where it is nearest to their x."""
-    nearest = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
-    return tuple(1 if path[k, 1] > y else -1 for k, y in zip(nearest, obstacles[:, 1], strict=True))

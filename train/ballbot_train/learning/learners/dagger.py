@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_baselines import batched, search
+from ballbot_baselines import batched
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_baselines.tvlqr import tube_gains
@@ -29,6 +29,7 @@ from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.paths import sides_passed
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import robot_name
 from ballbot_gym.rollout import PlanError
@@ -276,7 +277,7 @@ class Dagger:
         for i, wanted in enumerate(sides):
             if wanted:
                 obstacles, path = np.asarray(self._task.passed_obstacles(c[i])), optima.states[i]
-                mine, behind = search.side_choice(path, obstacles), obstacles[:, 0] < path[0, 0]
+                mine, behind = sides_passed(path, obstacles), obstacles[:, 0] < path[0, 0]
                 passes[i] = ((np.array(mine) == wanted[: len(mine)]) | behind).all()
         return passes
 
