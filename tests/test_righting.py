@@ -91,7 +91,8 @@ def test_feasible_episode_without_an_optimum_is_returned_and_says_so(unconverged
 
 
 def test_feasible_episode_gets_no_certificate(unconverged):
-    assert "only a feasible episode" in certification.entry("stabilize", 0)
+    ((_, error),) = certification.entries("stabilize", [0])
+    assert "only a feasible episode" in error
 
 
 def test_simulated_recovery_is_a_plan_where_no_solver_finds_one(altered, make_env, params):

@@ -303,12 +303,12 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
         )  # fmt: skip
 
     monkeypatch.setattr(certification, "find_optimum", found)
-    entries = {i: certification.entry("stabilize", i, "rolling") for i in range(2)}
+    entries = dict(certification.entries("stabilize", range(2), "rolling"))
     states = certification.arrays(entries, task, rolling)["states"]
     for i, draw in ((0, 0), (1, 2)):
         np.testing.assert_array_equal(states[i], certified.cache.episode(task, rolling, i, draw)[0])
     refused.append(certified.cache.episode(Stabilize(), default_params(), 0)[0])
-    assert certification.entry("stabilize", 0, "paper") == "it cannot but slip"
+    assert next(certification.entries("stabilize", [0], "paper")) == (0, "it cannot but slip")
 
 
 def test_a_certified_set_is_of_one_robot(tmp_path):

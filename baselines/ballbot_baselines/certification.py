@@ -1,20 +1,22 @@
 """Computes the certified evaluation sets that `ballbot_gym.certified` loads.
 
-`entry` solves an episode and gives a set of it alone, so that the work can be divided and continued.
+`entries` solves episodes and gives a set of each alone, so that the work can be divided and continued.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ballbot_baselines import batched
+from ballbot_baselines.compiled import LANES
 from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_baselines.search import COARSE
 from ballbot_gym import dynamics
 from ballbot_gym.certified import EvaluationSet
-from ballbot_gym.certified.cache import starts
+from ballbot_gym.certified.cache import episode, starts
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -24,31 +26,46 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 
-def entry(
-    task: str | Task, index: int, robot: str | BallbotParams = PAPER, randomization: Randomization = Randomization()
-) -> EvaluationSet | str:
-    """Solves an episode of a task for a robot: the set of it alone with its optimum, or why none was found.
+AT_ONCE = LANES
+"""Episodes whose second searches share the processor's lanes."""
+
+
+def entries(
+    task: str | Task,
+    indices: Iterable[int],
+    robot: str | BallbotParams = PAPER,
+    randomization: Randomization = Randomization(),
+) -> Iterator[tuple[int, EvaluationSet | str]]:
+    """Solves episodes of a task for a robot: the number of each, and a set of it alone with its optimum, or why none was found.
 
     If the robot's friction is limited or the robot varies, an episode without an optimum is drawn again: some starts make the
     robot slip whatever it does, and only the search tells which.
 
     Args:
         task: the problem, or its name in `TASKS`.
-        index: of the episode.
-        robot: whose optimum, or its name in `ROBOTS`.
-        randomization: what the robot and the actuator of the episode are drawn from.
+        indices: of the episodes.
+        robot: whose optima, or its name in `ROBOTS`.
+        randomization: what the robot and the actuator of each episode are drawn from.
 
     Raises:
         ValueError: no task or robot of that name.
     """
-    task, params, why = make_task(task, robot), checked_robot(robot), ""
+    task, params, left = make_task(task, robot), checked_robot(robot), iter(indices)
     redrawn = None if params.grips or randomization.moves_optima else 1
-    for start in itertools.islice(starts(task, params, index, randomization), redrawn):
-        try:
-            return _solved(task, params, randomization, *start)
-        except PlanError as error:
-            why = str(error)
-    return why
+    at_once = not randomization.moves_optima and batched.solves(task, params)  # else each has another robot
+    while some := list(itertools.islice(left, AT_ONCE)):
+        x0, c = (np.array(part) for part in zip(*(episode(task, params, index) for index in some), strict=True))
+        second = batched.find_optima(task, params, x0, c) if at_once else None
+        for k, index in enumerate(some):
+            found: EvaluationSet | str = ""
+            twice = True if second is None else second.some(slice(k, k + 1))
+            for start in itertools.islice(starts(task, params, index, randomization), redrawn):
+                try:
+                    found = _solved(task, params, randomization, *start, twice)
+                    break
+                except PlanError as error:
+                    found, twice = str(error), True
+            yield index, found
 
 
 def _solved(
@@ -58,9 +75,10 @@ def _solved(
     x0: np.ndarray,
     c: np.ndarray,
     drawn: tuple[float, ...],
+    twice: bool | batched.BatchOptima,
 ) -> EvaluationSet:
     """The set of one episode; raises a PlanError where no optimum is found."""
-    optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn)
+    optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn, twice)
     if drawn and drawn[5] > 0:
         ideal = _optimal(task, randomization.robot(params, drawn), x0, c)
     return EvaluationSet(
@@ -76,9 +94,9 @@ def _solved(
     )
 
 
-def _optimal(*problem: Any, **options: Any) -> Optimum:
+def _optimal(*problem: Any, twice: bool | batched.BatchOptima = True, **options: Any) -> Optimum:
     """What `find_optimum` finds in two searches; raises a PlanError for an episode that is merely feasible."""
-    found = find_optimum(*problem, twice=True, **options)
+    found = find_optimum(*problem, twice=twice, **options)
     if not found.is_optimal:
         raise PlanError(f"only a feasible episode of cost {found.cost:.6g} was found ({found.solver_status})")
     return found
@@ -91,6 +109,7 @@ def optimum_of(
     c: np.ndarray,
     randomization: Randomization,
     drawn: tuple[float, ...],
+    twice: bool | batched.BatchOptima = True,
 ) -> Optimum:
     """The optimum of an episode for which a randomization drew this: of its own robot, and no force comes while it is late.
 
@@ -101,6 +120,7 @@ def optimum_of(
         c: (nc,) constants.
         randomization: without an actuator that lags; noise and pushes move no optimum.
         drawn: what its `draw` drew.
+        twice: as of `find_optimum`, where no force is late.
 
     Raises:
         PlanError: the robot violates a limit before it can be moved, or no try came to an optimum.
@@ -109,7 +129,7 @@ def optimum_of(
         params = randomization.robot(params, drawn)
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
-        return _optimal(task, params, x0, c)
+        return _optimal(task, params, x0, c, twice=twice)
     dt, none, states, cost = task.control_dt, np.zeros(params.action_size), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)

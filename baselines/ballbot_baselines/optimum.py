@@ -77,7 +77,7 @@ def find_optimum(
     guesses: int = _CONSIDERED,
     paths: list[np.ndarray] | None = None,
     start: float = 0.0,
-    twice: bool = False,
+    twice: bool | batched.BatchOptima = False,
 ) -> Optimum:
     """The cheapest episode from state x0 with constants c.
 
@@ -91,8 +91,8 @@ def find_optimum(
             those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
         paths: ground paths to start from instead of the task's, (n+1, 2) each, m, one point for each control step.
         start: the episode's time at x0, s: the trajectory's times begin there. It matters to tasks with a clock.
-        twice: whether `batched.find_optima` searches too, where it can. It starts from other guesses, and finds something
-            cheaper in about one episode of a hundred.
+        twice: whether `batched.find_optima` searches too, where it can, or what it found for this episode. It starts from
+            other guesses, and finds something cheaper in about one episode of a hundred.
 
     Returns:
         The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
@@ -110,8 +110,10 @@ def find_optimum(
         tried += found
         if any(solution.is_optimal for solution in found):
             break
-    if twice and batched.solves(task, params):
-        tried += _cheaper(episode, min((s.cost for s in tried if s.is_optimal), default=math.inf))
+    if twice is True and batched.solves(task, params):
+        twice = batched.find_optima(task, params, x0[None], c[None], backoff)
+    if isinstance(twice, batched.BatchOptima):
+        tried += _cheaper(episode, twice, min((s.cost for s in tried if s.is_optimal), default=math.inf))
     within = [solution for solution in tried if solution.is_within_limits]
     # optima come before feasible episodes, and cheap ones before expensive ones
     best = min(within, key=lambda solution: (not solution.success, solution.cost), default=None)
@@ -135,14 +137,12 @@ def find_optimum(
     )
 
 
-def _cheaper(episode: Shooting, cost: float) -> list[OcpSolution]:
-    """Solutions from what `batched.find_optima` finds, if that is cheaper."""
-    task, params = episode.task, episode.params
-    found = batched.find_optima(task, params, episode.x0[None], episode.c[None], episode.backoff)
+def _cheaper(episode: Shooting, found: batched.BatchOptima, cost: float) -> list[OcpSolution]:
+    """Solutions from what was found at once for an episode, if that is cheaper."""
     if not found.solved[0] or found.costs[0] > cost * (1 - _NO_CHEAPER):
         return []
     x, u = found.states[0, : found.steps[0] + 1], found.forces[0, : found.steps[0]]
-    return episode.solve_to_the_end(x, u / params.force_limit, near=True)
+    return episode.solve_to_the_end(x, u / episode.params.force_limit, near=True)
 
 
 def plan_to_track(

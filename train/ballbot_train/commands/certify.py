@@ -92,5 +92,5 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
 
 
 def _optima(task: str, robot: str, episodes: range) -> dict[str, np.ndarray]:
-    found = {index: certification.entry(task, index, robot) for index in episodes}
+    found = dict(certification.entries(task, episodes, robot))
     return certification.arrays(found, make_task(task, robot), named_robot(robot))

@@ -3,8 +3,11 @@
 Importing this module is light: CasADi is imported when an optimum is computed.
 """
 
+import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +27,9 @@ from ballbot_train.executors import Workers, completed
 
 with imports_of(__name__):
     import filelock
+
+
+_TASKS = 32  # at least, so that many workers have something to do
 
 
 def known(
@@ -98,10 +104,18 @@ def compute(
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as advance:
-            from ballbot_baselines.certification import entry
+            from ballbot_baselines.certification import AT_ONCE, entries
 
-            work = ((index, entry, (task, index, params, randomization)) for index in missing)
-            for index, found in completed(work, workers):
+            solve = partial(entries, task, robot=params, randomization=randomization)
+            each = min(AT_ONCE, -(-len(missing) // _TASKS))
+            parts = (missing[k : k + each] for k in range(0, len(missing), each))
+            work = ((part, _solved, (solve, part)) for part in parts)
+            solved = (
+                [solve(missing)]
+                if Workers.of(workers).here == 1
+                else (entries for _, entries in completed(work, workers))
+            )
+            for index, found in itertools.chain.from_iterable(solved):
                 advance(name, 1)
                 if isinstance(found, str):
                     failures.append(f"episode {index}: {found}")
@@ -134,3 +148,7 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
             raise ValueError(
                 f"{kind}.guess_paths gives the shape {np.shape(path)} {where}; give finite (n+1, 2) positions, m"
             )
+
+
+def _solved(solve: Callable[[list[int]], Iterator[Any]], part: list[int]) -> list[Any]:
+    return list(solve(part))
