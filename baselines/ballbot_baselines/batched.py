@@ -379,6 +379,7 @@ class _Batch:
             for s in range(arrival - 1, arrival + 2)
         ]
         while wanted := [(i, s) for i, s in wanted if 1 <= s <= task.steps]:
+            wanted.sort(key=lambda pair: pair[1])  # episodes of about as many steps are solved together
             rows, steps = np.array(wanted).T
             x, a = np.zeros((len(rows), steps.max() + 1, 8)), np.zeros((len(rows), steps.max(), 2))
             for s in np.unique(steps).tolist():

@@ -25,7 +25,6 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
-
 AT_ONCE = LANES
 """Episodes whose second searches share the processor's lanes."""
 
@@ -36,7 +35,7 @@ def entries(
     robot: str | BallbotParams = PAPER,
     randomization: Randomization = Randomization(),
 ) -> Iterator[tuple[int, EvaluationSet | str]]:
-    """Solves episodes of a task for a robot: the number of each, and a set of it alone with its optimum, or why none was found.
+    """Solves episodes of a task: yields the number of each, and a set of it alone with its optimum, or why none was found.
 
     If the robot's friction is limited or the robot varies, an episode without an optimum is drawn again: some starts make the
     robot slip whatever it does, and only the search tells which.

@@ -9,7 +9,7 @@
 #define AHEAD (STATES * (STATES + 1) / 2 + STATES + 1) /* second derivatives, slopes, and what a step promises */
 #define AT(rows) &(rows)[0][0], LANES
 #define EACH_LANE for (int k = 0; k < LANES; ++k)
-#define EACH_STEP for (step *s = b->s; s < b->s + b->n; ++s)
+#define EACH_STEP for (step *s = b->first; s < b->s + b->n; ++s)
 
 typedef struct {
     double width, tolerance, violation, bends, multiplier;
@@ -66,20 +66,21 @@ typedef struct {
     real m[PATH + 1][LANES], g[PATH + 1][LANES], g_new[PATH + 1][LANES];
 } step;
 
-/* LANES episodes. */
+/* LANES episodes. All their steps before `first` have no length. */
 typedef struct {
-    int64_t n, active, job[LANES], tick[LANES];
+    int64_t n, active, job[LANES], tick[LANES], empty[LANES];
+    step *first;
     options o[LANES];
     real e[END + 1][LANES], ge[END + 1][LANES], ge_new[END + 1][LANES], p[PARAMS + 1][LANES], ahead[2][AHEAD][LANES];
     real value[1][LANES], width[1][LANES], share[1][LANES], damping[1][LANES], open[1][LANES];
-    real merit[LANES], merit_new[LANES], cost[LANES], cost_new[LANES], *promised;
+    real merit[LANES], merit_new[LANES], cost[LANES], cost_new[LANES], promised[LANES];
     step s[]; /* n+1 */
 } block;
 
 /* An episode takes up lane k. */
 static void load(block *b, const problems *q, int64_t j, int k) {
     const int64_t n = b->n, empty = n - q->steps[j];
-    b->job[k] = j;
+    b->job[k] = j, b->empty[k] = empty;
     ++b->active, b->tick[k] = 0, b->merit[k] = INFINITY;
     b->o[k] = q->each[j], b->width[0][k] = b->o[k].width, b->share[0][k] = 1, b->damping[0][k] = 0;
     for (int64_t t = 0; t <= n; ++t) {
@@ -102,7 +103,7 @@ static void off(block *b, int k, real *gap, real *missed) {
 }
 
 static void unload(block *b, const problems *q, int k, int solved) {
-    const int64_t n = b->n, j = b->job[k], empty = n - q->steps[j];
+    const int64_t n = b->n, j = b->job[k], empty = b->empty[k];
     for (int64_t t = empty; t <= n; ++t) {
         const step *s = &b->s[t];
         const int64_t row = t - empty;
@@ -120,37 +121,36 @@ static void unload(block *b, const problems *q, int k, int solved) {
 
 static void backwards(block *b) {
     end(AT(b->s[b->n].x), AT(b->e), AT(b->p), AT(b->width), AT(b->ahead[b->n & 1]), AT(b->value), AT(b->ge_new));
-    for (int64_t t = b->n - 1; t >= 0; --t) {
-        step *s = &b->s[t];
+    int64_t t = b->n - 1;
+    for (step *s = &b->s[t]; s >= b->first; --s, --t)
         sweep(AT(b->ahead[(t + 1) & 1]), AT(s->x), AT(s->a), AT(s->dt), AT(s->m), AT(b->p), AT(b->width), AT(b->damping),
               AT(s[1].x), AT(b->open), AT(b->ahead[t & 1]), AT(s->change), AT(s->gain), AT(s->slope));
-    }
-    b->promised = b->ahead[0][AHEAD - 1];
-    memcpy(b->s->x_new, b->s->x, sizeof b->s->x);
+    memcpy(b->promised, b->ahead[(t + 1) & 1][AHEAD - 1], sizeof b->promised);
+    memcpy(b->first->x_new, b->first->x, sizeof b->first->x);
 #if STATES > 8
     EACH_LANE { /* the length of the steps is free */
-        const real first = b->ahead[0][AHEAD - 2][k], second = b->ahead[0][AHEAD - STATES - 2][k], h = b->s->x[8][k];
+        const real first = b->ahead[0][AHEAD - 2][k], second = b->ahead[0][AHEAD - STATES - 2][k], h = b->first->x[8][k];
         const real most = 0.15 * h, wanted = second > 0 ? -first / second : -first * INFINITY;
         real move = b->share[0][k] * (wanted > most ? most : wanted < -most ? -most : wanted);
         if (!(move == move)) move = 0;
         const real low = b->p[PARAMS - 2][k], high = b->p[PARAMS - 1][k];
-        b->s->x_new[8][k] = h + move < low ? low : h + move > high ? high : h + move;
-        b->promised[k] -= first * (b->s->x_new[8][k] - h) / 2;
+        b->first->x_new[8][k] = h + move < low ? low : h + move > high ? high : h + move;
+        b->promised[k] -= first * (b->first->x_new[8][k] - h) / 2;
     }
 #endif
 }
 
 /* Bends guesses that are no motions: a Newton step on the dynamics. */
 static void bend_guesses(block *b) {
-    memset(b->s->shift, 0, sizeof b->s->shift);
-    EACH_LANE for (int i = 8; i < STATES; ++i) b->s->shift[i][k] = b->s->x_new[i][k] - b->s->x[i][k];
+    memset(b->first->shift, 0, sizeof b->first->shift);
+    EACH_LANE for (int i = 8; i < STATES; ++i) b->first->shift[i][k] = b->first->x_new[i][k] - b->first->x[i][k];
     EACH_STEP
         bend(AT(s->x), AT(s->shift), AT(s[1].x), AT(s->a), AT(s->change), AT(b->share), AT(s->gain), AT(s->dt), AT(b->p),
              AT(s[1].shift), AT(s->a_new));
     EACH_LANE if (b->job[k] >= 0 && b->tick[k] < b->o[k].bends) {
         EACH_STEP for (int i = 0; i < 2; ++i) s->a[i][k] = s->a_new[i][k];
-        for (int64_t t = 0; t <= b->n; ++t)
-            for (int i = 0; i < STATES; ++i) b->s[t].x[i][k] += b->s[t].shift[i][k];
+        for (step *s = b->first; s <= b->s + b->n; ++s)
+            for (int i = 0; i < STATES; ++i) s->x[i][k] += s->shift[i][k];
         ++b->tick[k];
     }
 }
@@ -175,7 +175,7 @@ static void accept(block *b, int k) {
         for (int i = 0; i < PATH; ++i) s->g[i][k] = s->g_new[i][k];
         for (int i = 0; i < STATES; ++i) s[1].x[i][k] = s[1].x_new[i][k];
     }
-    for (int i = 0; i < STATES; ++i) b->s->x[i][k] = b->s->x_new[i][k];
+    for (int i = 0; i < STATES; ++i) b->first->x[i][k] = b->first->x_new[i][k];
     for (int i = 0; i < END; ++i) b->ge[i][k] = b->ge_new[i][k];
     b->cost[k] = b->cost_new[k], b->merit[k] = b->merit_new[k];
 }
@@ -229,8 +229,10 @@ void solve(int64_t jobs, int64_t n, double length, const options *each, const in
     EACH_LANE b->job[k] = -1, b->width[0][k] = 1;
     for (;;) {
         int bending = 0, simulating = 0, bends[LANES];
+        b->first = b->s + n;
         EACH_LANE {
             if (b->job[k] < 0 && next < jobs) load(b, &q, next++, k);
+            if (b->job[k] >= 0 && b->s + b->empty[k] < b->first) b->first = b->s + b->empty[k];
             bends[k] = b->job[k] >= 0 && b->tick[k] < b->o[k].bends;
             b->open[0][k] = b->tick[k] <= b->o[k].bends;
             if (b->job[k] >= 0) *(bends[k] ? &bending : &simulating) = 1;
