@@ -148,10 +148,16 @@ class Ilqr:
 
     Raises:
         machine_code.NoMachineCodeError: it cannot be compiled here.
-        NotImplementedError: the task has an operation that `codegen` does not know.
+        NotImplementedError: the task has an operation that `codegen` does not know, or a clock; or the robot has wheels.
     """
 
     def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
+        if task.clock:
+            raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
+        if params.wheels is not None:
+            raise NotImplementedError(
+                "many optima at once know no robot with wheels; find_optimum solves them one by one"
+            )
         kind = kind_of(task, params)  # which refuses formulas that cannot be optimized
         self._limit, self.rest = params.force_limit, None if free_time else rest(task, params)
         library, self._sizes = _compiled(*kind, free_time, self.rest is not None)
@@ -230,14 +236,8 @@ class Ilqr:
         return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
 
 
-@functools.lru_cache(maxsize=8)
-def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
-    """The solver, made once."""
-    if task.clock:
-        raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
-    if params.wheels is not None:
-        raise NotImplementedError("many optima at once know no robot with wheels; find_optimum solves them one by one")
-    return Ilqr(task, params, free_time)
+ilqr = functools.lru_cache(maxsize=8)(Ilqr)
+"""The solver, made once."""
 
 
 @functools.cache
