@@ -13,8 +13,8 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
+from ballbot_train.learning.learners.sac import demos_in_frame
 from ballbot_train.policy import PolicyNetwork, load_network, save_policy
 from ballbot_train.policy_files import shipped_policies
 

@@ -16,7 +16,7 @@ from torch import nn
 from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import Frame
+from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of
@@ -24,7 +24,6 @@ from ballbot_train.learning.critics import value_of_living, weigh_gradients
 from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.fitting import Fit, Samples
-from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
@@ -391,3 +390,27 @@ def _global_random() -> dict[str, Any]:
     """The state of the global generators of torch and NumPy: tensors and plain values."""
     kind, words, *rest = cast(Any, np.random.get_state())
     return {"torch": torch.get_rng_state(), "numpy": [kind, words.tolist(), *rest]}
+
+
+def seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a frame shows of observations (n, no), and where its axes are.
+
+    Returns:
+        Features (n, size) float32; and (n, 2, 2) float32, the frame's two directions as columns, which are orthonormal.
+    """
+    features, back = frame.features(tuple(observations.T))
+    one, zero = np.ones(len(observations), np.float32), np.zeros(len(observations), np.float32)
+    return _columns(features), np.stack([_columns(back(unit)) for unit in ((one, zero), (zero, one))], -1)
+
+
+def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*parts), -1).astype(np.float32)
+
+
+def to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Actions (n, 2) in [-1, 1] of the frame whose directions are the columns of axes (n, 2, 2), as actions of the world.
+
+    Times `REACH` and turned they include all of the world's, and the others are clipped, as `PolicyNetwork` does with the
+    squash "tanh_in_frame". So a small error of an action is small in both.
+    """
+    return np.clip(REACH * np.einsum("nij,nj->ni", axes, actions), -1.0, 1.0)

@@ -23,12 +23,12 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import robot_name
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, highest_value
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.frames import demos_in_frame
-from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
+from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, seen_in
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.policy_files import Mirrors
@@ -180,6 +180,17 @@ class SymmetricReplay(NStepReplayBuffer):
 
 
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
+    """Demonstrations with features in place of observations, and actions as the frame has them."""
+    observations, axes = seen_in(frame, demos.observations)
+    next_observations, _ = seen_in(frame, demos.next_observations)
+    turned = {
+        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(REACH)
+        for name in ("actions", "executed")
+    }
+    return replace(demos, observations=observations, next_observations=next_observations, **turned)
 
 
 class OwnActor(Actor):
