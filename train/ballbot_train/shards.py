@@ -111,27 +111,16 @@ class Shards:
         """The shards one after another, in order."""
         return map(self.read, self.numbers)
 
-    def begin(self, about: Mapping[str, Any]) -> None:
-        """Says what the set is made from, before the first shard is written.
-
-        Raises:
-            ValueError: the folder holds a set that is made from something else.
-        """
-        if self.about is not None:
-            jobs.check_same(self.about, about, Path(self.url), "a set")
-            return
-        self.about = json.loads(json.dumps(dict(about)))
-        self._write_manifest()
-
     def write(self, number: int, arrays: Arrays, episodes: int) -> None:
         """Adds a shard."""
         content = files.npz(arrays, compressed=False)  # trajectories hardly shrink, and one process writes all shards
         self._write(_name(number), content)
         digest = hashlib.sha256(content).hexdigest()
         self._shards[number] = {"file": _name(number), "episodes": episodes, "bytes": len(content), "sha256": digest}
-        self._write_manifest()
+        self.write_manifest()
 
-    def _write_manifest(self) -> None:
+    def write_manifest(self) -> None:
+        """Says what the set is made from and what is finished of it."""
         manifest = {"version": _VERSION, "about": self.about, "shards": {i: self._shards[i] for i in self.numbers}}
         self._write(MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
 
@@ -182,7 +171,11 @@ def make(
     shards = Shards(url)
     about = {**about, "per_shard": per_shard}
     jobs.claim(out, {"shards": url, **about}, "set.json")
-    shards.begin(about)
+    if shards.about is None:
+        shards.about = about
+        shards.write_manifest()
+    else:
+        jobs.check_same(shards.about, about, Path(url), "a set")
     folder = jobs.unfinished(out)
 
     def parts_of(shard: int) -> dict[range, Path]:

@@ -20,7 +20,6 @@ from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
 _MOST_EPISODES = 100_000
-_MOST_IN_SHARDS = 100_000_000
 
 
 def certify(
@@ -48,11 +47,8 @@ def certify(
     """
     check_some("task", tasks, TASKS)
     check_least(1, episodes=episodes)
-    most = _MOST_EPISODES if shards is None else _MOST_IN_SHARDS
-    if episodes > most:
-        raise ValueError(
-            f"episodes must be at most {most}, not {episodes}" + (most < _MOST_IN_SHARDS) * "; or give --shards"
-        )
+    if shards is None and episodes > _MOST_EPISODES:
+        raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}; or give --shards")
     varied = checked_randomization(randomization)
     if randomization and not varied.moves_optima:
         raise ValueError(f"{randomization} moves no optimum: its episodes have the optima without --randomization")

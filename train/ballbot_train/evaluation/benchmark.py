@@ -224,7 +224,7 @@ def _episode_entries(
     record: bool,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
-    robot = group.robot if group.friction is None else floor(group.robot, group.friction)
+    robot = floor(group.robot, group.friction)
     env = BallbotEnv(group.task, physics=group.physics, randomization=group.randomization, robot=robot)
     made = as_controller(sent, *group.believed)
     env = shown_to(made, env)

@@ -5,7 +5,7 @@ from pathlib import Path
 from ballbot_baselines import CONTROLLERS, FILTERS, VARIANTS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
+from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
@@ -115,11 +115,9 @@ def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
         return "stabilize"
     named = next((name for name in TASKS if is_made_for(policy, make_task(name, robot), robot)), None)
     if named is None:
-        for other in ROBOTS:
-            if any(is_made_for(policy, make_task(name, other), other) for name in TASKS):
-                raise ValueError(f"{policy} was made for the robot {other}; give --robot {other}")
         raise ValueError(
-            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields"
+            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields for the "
+            f"robot {robot}; give --task, or another --robot"
         )
     return named
 
