@@ -36,7 +36,7 @@ def episode(motion):
 
 
 def optimum(motion):
-    return Optimum(10.0, motion, "optimal", "solved", 1e-9, 12, "ipopt", 0, 0.5, 0.1, 0.1, np.zeros((1000, 8)))
+    return Optimum(10.0, motion, "optimal", "solved", 1e-9, 12, "ipopt", 0.5, np.zeros((1000, 8)))
 
 
 SHOWN = {

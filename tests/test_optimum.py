@@ -7,7 +7,7 @@ import casadi
 
 from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.ocp import FEASIBLE, Bounds, Ocp, OcpSolver
+from ballbot_baselines.ocp import FEASIBLE, Ocp, OcpSolver
 from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
@@ -145,21 +145,21 @@ def toy():
 
 
 def toy_bounds(ocp):
-    bounds = Bounds.free(ocp, N)
-    bounds.state_lower[0, 1] = bounds.state_upper[0, 1] = -0.3
-    bounds.state_lower[0, 0] = 0.4
-    bounds.input_lower[:], bounds.input_upper[:] = -2, 1.5
-    return bounds
+    lower, upper = ocp.no_bounds(N)
+    lower[0, 1] = upper[0, 1] = -0.3
+    lower[0, 0] = 0.4
+    lower[:, 3:], upper[:, 3:] = -2, 1.5
+    return lower, upper
 
 
 def solve_toy(solver, p=0.4):
     ocp = toy()
-    return OcpSolver(ocp, N, solver).solve(np.full((N + 1, 3), 0.1), np.full((N, 2), 0.1), toy_bounds(ocp), [p])
+    return OcpSolver(ocp, N, solver).solve(np.full((N + 1, 3), 0.1), np.full((N, 2), 0.1), *toy_bounds(ocp), [p])
 
 
 def solve_toy_by_casadi(p=0.4):
     """The same problem written out in one piece and differentiated by CasADi: cost, states, inputs, iterations."""
-    ocp, bounds = toy(), toy_bounds(toy())
+    ocp, (lower, upper) = toy(), toy_bounds(toy())
     s, w = casadi.SX.sym("s", 3, N + 1), casadi.SX.sym("w", 2, N)
     columns = [(s[:, k], w[:, k], p) for k in range(N)]
     equal = [casadi.mtimes(casadi.DM(ocp.initial_matrix), s[:, 0]), ocp.final_equalities(s[:, N], p)]
@@ -172,8 +172,8 @@ def solve_toy_by_casadi(p=0.4):
     solver = casadi.nlpsol("plain", "ipopt", {"x": z, "f": cost, "g": casadi.vertcat(equal, unequal)}, options)
     result = solver(
         x0=0.1,
-        lbx=np.concatenate([bounds.state_lower.ravel(), bounds.input_lower.ravel()]),
-        ubx=np.concatenate([bounds.state_upper.ravel(), bounds.input_upper.ravel()]),
+        lbx=np.concatenate([lower[:, :3].ravel(), lower[:-1, 3:].ravel()]),
+        ubx=np.concatenate([upper[:, :3].ravel(), upper[:-1, 3:].ravel()]),
         lbg=0,
         ubg=np.concatenate([np.zeros(equal.shape[0]), np.full(unequal.shape[0], np.inf)]),
     )
@@ -203,9 +203,10 @@ def test_staged_derivatives_are_exact_to_second_order():
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_infeasible_bounds_are_reported_not_hidden(solver):
     ocp = toy()
-    bounds = toy_bounds(ocp)
-    bounds.state_lower[3:, 0] = 2.0  # where 0.3 − s₀² ≥ 0 cannot hold
-    solution = OcpSolver(ocp, N, solver, max_iterations=50).solve(np.zeros((N + 1, 3)), np.zeros((N, 2)), bounds, [0.4])
+    lower, upper = toy_bounds(ocp)
+    lower[3:, 0] = 2.0  # where 0.3 − s₀² ≥ 0 cannot hold
+    given = np.zeros((N + 1, 3)), np.zeros((N, 2)), lower, upper, [0.4]
+    solution = OcpSolver(ocp, N, solver, max_iterations=50).solve(*given)
     assert not solution.success
     assert solution.violation > 1e-3
     assert solution.status

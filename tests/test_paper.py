@@ -8,7 +8,7 @@ pytest.importorskip("casadi")
 from ballbot_baselines import guess as guesses
 from ballbot_baselines import paper_problems
 from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, state, straight_guess
+from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, hermite_guess, state
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
@@ -124,22 +124,6 @@ def test_cost_is_the_papers_sum_over_knots(plan_of):
     assert plan.cost == pytest.approx(knots.sum(), rel=1e-9)
 
 
-LINES = {"stabilize-1": 2.0, "stabilize-5": 3.0, "turn-3": 2.0, "turn-10": 6.0}  # s
-
-
-def line_of(name, params, seconds):
-    problem = PAPER_PROBLEMS[name].problem
-    return straight_guess(params, problem.initial[0], problem.final[0], seconds)
-
-
-@pytest.mark.parametrize("name", LINES)
-def test_papers_straight_line_guess_leads_to_the_same_optimum(plan_of, params, name):
-    plan = solve(PAPER_PROBLEMS[name].problem, params, line_of(name, params, LINES[name]))
-    assert plan.cost == pytest.approx(plan_of(name).cost, rel=1e-7)
-    # measured: 8, 10, 8 and 29 or 43; from the unbent line up to 121, and none for the last
-    assert plan.iterations <= 60
-
-
 def test_collocation_error_shrinks_as_knots_are_added(plan_of, params):
     for name, factor in (("stabilize-1", 4), ("turn-3", 4), ("stabilize-5", 2)):
         coarse, entry = plan_of(name), PAPER_PROBLEMS[name]
@@ -171,7 +155,7 @@ def test_problem_without_a_solution_raises_with_status_and_violation(params, sol
     x0 = state(x=-1.0, vy=5.0)
     hurried = replace(between_states("hurried", x0, state()), step=(0.005, 0.01))  # 0.4 s to stop from 5 m/s
     with pytest.raises(PlanError, match=rf"hurried: {solver} found no plan: \w+.*violated by \d\.\de[+-]\d\d"):
-        solve(hurried, params, straight_guess(params, x0, state(), 0.4), solver, max_iterations=60)
+        solve(hurried, params, hermite_guess(params, x0, state(), 0.4), solver, max_iterations=60)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -179,7 +163,7 @@ def test_start_beyond_the_lean_limit_raises_a_plan_error(params, solver):
     x0 = state(x=-1.0, vy=1.0)
     x0[2] = 1.2  # the limit is 1
     with pytest.raises(PlanError, match="leaning"):
-        solve(between_states("leaning", x0, state()), params, straight_guess(params, x0, state(), 2.0), solver)
+        solve(between_states("leaning", x0, state()), params, hermite_guess(params, x0, state(), 2.0), solver)
 
 
 def test_guess_along_an_accelerating_path_is_the_motion_itself(params):

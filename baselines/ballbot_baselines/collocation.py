@@ -14,22 +14,19 @@ variables q are states that do not change.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import ACCEPTABLE, Bounds, Ocp, OcpSolution, OcpSolver, no_path
+from ballbot_baselines.ocp import ACCEPTABLE, Ocp, OcpSolution, OcpSolver, no_path
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
-_UNLIKE = 0.2
-"""A guess counts as a motion if its velocities explain all but this share of its changes. Measured: smooth paths and
-solutions leave up to 0.09 unexplained, straight lines 0.54 to 1."""
 _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
 
 
@@ -142,11 +139,10 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
 def solve(
     problem: Problem, params: BallbotParams, guess: Guess, solver: str = "ipopt", max_iterations: int = 500
 ) -> Plan:
-    """Solves a problem from a guess.
+    """Solves a problem from a guess, which should be roughly a motion.
 
-    A guess that is no motion, such as the paper's straight line from state to state, is first bent toward a motion by one
-    or two Newton steps on the dynamics. Without them the solvers take up to 12 times as many iterations from the line, or
-    stop at an infeasible point.
+    From a straight line between two states the solvers take up to 12 times as many iterations, or stop at an infeasible
+    point.
 
     Raises:
         PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
@@ -156,12 +152,9 @@ def solve(
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
     constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
-    states, inputs = np.hstack([knots, constant]), knots[1:, _INPUTS]
     optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
     started = time.perf_counter()
-    if not _is_motion(guess):
-        states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(problem, bounds, states))
-    result = optimizer.solve(states, inputs, bounds)
+    result = optimizer.solve(np.hstack([knots, constant]), knots[1:, _INPUTS], *bounds)
     seconds = time.perf_counter() - started
     converged = result.success or result.status == ACCEPTABLE
     if not (converged and result.is_within_limits):
@@ -172,24 +165,8 @@ def solve(
     return _plan(problem, params, result, seconds)
 
 
-def _is_motion(guess: Guess) -> bool:
-    """Whether the guess's velocities and lean rates roughly explain how its positions and leans change."""
-    changes = np.diff(guess.x[:, :4], axis=0)
-    expected = 0.5 * guess.h * (guess.x[1:, 4:] + guess.x[:-1, 4:])
-    return bool(np.abs(changes - expected).sum() <= _UNLIKE * (np.abs(changes) + np.abs(expected)).sum())
-
-
-def _with_given_times(problem: Problem, bounds: Bounds, states: np.ndarray) -> Bounds:
-    """Bounds that also fix the step and the free variables at the guess's values."""
-    lower, upper = bounds.state_lower.copy(), bounds.state_upper.copy()
-    held = slice(_H, _free(problem).stop)
-    lower[:, held] = upper[:, held] = np.clip(states[:, held], lower[0, held], upper[0, held])
-    return replace(bounds, state_lower=lower, state_upper=upper)
-
-
-def _bounds(problem: Problem, ocp: Ocp) -> Bounds:
-    bounds = Bounds.free(ocp, problem.intervals)
-    lower, upper = bounds.state_lower, bounds.state_upper
+def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
+    lower, upper = ocp.no_bounds(problem.intervals)
     lower[:, 2:4], upper[:, 2:4] = -problem.lean_limit, problem.lean_limit
     lower[:, _A], upper[:, _A] = -1, 1
     for knot, (low, high) in ((0, problem.initial), (-1, problem.final)):
@@ -204,7 +181,7 @@ def _bounds(problem: Problem, ocp: Ocp) -> Bounds:
         raise PlanError(
             f"{problem.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
         )
-    return bounds
+    return lower, upper
 
 
 def _plan(problem: Problem, params: BallbotParams, result: OcpSolution, seconds: float) -> Plan:

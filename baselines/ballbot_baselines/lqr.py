@@ -30,15 +30,7 @@ def discrete_lqr(
     task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx."""
-    q, r = (weight[0] * task.control_dt for weight in quadratic_cost(task, x[None], u[None], c, t))
-    return weighted_lqr(params, x, u, task.control_dt, q, r)
-
-
-def weighted_lqr(
-    params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float, q: np.ndarray, r: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """K (2, 8) and P (8, 8) about an equilibrium for weights q (8, 8) and r (2, 2) of a step of dt s."""
-    a, b = (matrix[0] for matrix in discretize(params, x[None], u[None], dt))
+    a, b, q, r = (matrix[0] for matrix in _steps(task, params, x[None], u[None], c, t))
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 

@@ -30,12 +30,6 @@ SUCCEEDED = "Solve_Succeeded"
 ACCEPTABLE = "Solved_To_Acceptable_Level"
 """The status of ipopt where it stopped early, at its acceptable tolerance."""
 
-_DAMPING = 1e-8  # of the Newton step toward consistency: constraints may repeat each other, or have no free variables
-_FAR = 5.0
-"""A second Newton step toward consistency follows where the first changes a variable by at least this much. Measured on 33
-turns and stops from straight lines: there the second saves fatrop a third of its iterations on turns and costs it two on
-stops. After smaller changes it saves nothing."""
-
 
 def no_path(*arguments: casadi.SX) -> casadi.SX:
     """No constraint."""
@@ -95,21 +89,10 @@ class Ocp:
             initial_matrix=np.zeros((0, self.states)) if self.initial_matrix is None else self.initial_matrix,
         )
 
-
-@dataclass(frozen=True)
-class Bounds:
-    """Lower and upper bounds of states (N+1, ns) and inputs (N, nw); ±inf means no bound."""
-
-    state_lower: np.ndarray
-    state_upper: np.ndarray
-    input_lower: np.ndarray
-    input_upper: np.ndarray
-
-    @classmethod
-    def free(cls, ocp: Ocp, intervals: int) -> "Bounds":
-        """No bounds, to be filled in."""
-        states, inputs = (intervals + 1, ocp.states), (intervals, ocp.inputs)
-        return cls(np.full(states, -np.inf), np.full(states, np.inf), np.full(inputs, -np.inf), np.full(inputs, np.inf))
+    def no_bounds(self, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds (N+1, ns + nw) of [s_k, w_k] to be filled in; the last inputs do not exist."""
+        infinite = np.full((intervals + 1, self.states + self.inputs), np.inf)
+        return -infinite, infinite
 
 
 @dataclass(frozen=True)
@@ -191,27 +174,33 @@ class OcpSolver:
         else:
             options |= for_ipopt | {"ipopt": own | {"sb": "yes"}}
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
-        self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
+        self._g = derivatives["nlp_g"]
 
     def solve(
-        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
+        self,
+        states: np.ndarray,
+        inputs: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        p: np.ndarray | Sequence[float] = (),
     ) -> OcpSolution:
         """Solves from a guess.
 
         Args:
             states: (N+1, ns) guess.
             inputs: (N, nw) guess.
-            bounds: equal lower and upper bounds fix a variable, as the initial state's.
+            lower: bounds as of `Ocp.no_bounds`. Equal ones fix a variable, as the initial state's.
+            upper: as `lower`.
             p: (np,) parameters.
 
         Returns:
             The last iterate with the solver's status; `success` says whether it converged.
         """
         p = np.asarray(p, np.float64)
-        lower = _interleave(bounds.state_lower, bounds.input_lower)
-        upper = _interleave(bounds.state_upper, bounds.input_upper)
+        lower, upper = (bound.ravel()[: -self.ocp.inputs] for bound in (lower, upper))
+        guess = np.concatenate([np.hstack([states[:-1], inputs]).ravel(), states[-1]])
         result = self._nlpsol(
-            x0=np.clip(_interleave(states, inputs), lower, upper),
+            x0=np.clip(guess, lower, upper),
             p=p,
             lbx=lower,
             ubx=upper,
@@ -226,62 +215,20 @@ class OcpSolver:
             np.max(np.maximum(self._g_lower - g, g - self._g_upper), initial=0.0),
             np.max(np.maximum(lower - z, z - upper), initial=0.0),
         )
-        states, inputs = self._divide(z)
+        ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
+        stages = z[: self.intervals * width].reshape(self.intervals, width)
         return OcpSolution(
             success=bool(stats["success"] and status == SUCCEEDED and np.isfinite(z).all()),
             status=status,
             cost=float(result["f"]),
-            states=states,
-            inputs=inputs,
+            states=np.vstack([stages[:, :ns], z[self.intervals * width :]]),
+            inputs=stages[:, ns:].copy(),
             violation=float(violation),
             iterations=int(stats["iter_count"]),
             solver=self.solver,
             # Gaps are s_{k+1} − next_k, and the cost's slope with respect to their right-hand side is minus the multiplier.
             costates=-np.array(result["lam_g"]).ravel()[self._gaps],
         )
-
-    def toward_consistency(
-        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints; after a large step, by a second one.
-
-        Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
-        the nearest motion. Guesses that obey the constraints do not change. A step takes as long as one or two iterations.
-
-        Args:
-            bounds: as `solve` takes them; variables with equal bounds do not change.
-            states: as `solve` takes them.
-            inputs: as `solve` takes them.
-            p: as `solve` takes them.
-
-        Returns:
-            states (N+1, ns) and inputs (N, nw).
-        """
-        lower = _interleave(bounds.state_lower, bounds.input_lower)
-        upper = _interleave(bounds.state_upper, bounds.input_upper)
-        z = np.clip(_interleave(states, inputs), lower, upper)
-        equal, among_free = np.flatnonzero(self._g_upper == 0).tolist(), casadi.diag(casadi.DM(lower < upper))
-        for _ in range(2):
-            g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
-            slopes = jacobian[equal, :] @ among_free
-            products = slopes @ slopes.T + _DAMPING * casadi.DM.eye(len(equal))
-            step = np.array(slopes.T @ casadi.solve(products, -g[equal], "ldl")).ravel()
-            if not np.isfinite(step).all():
-                break
-            z = np.clip(z + step, lower, upper)
-            if np.abs(step).max(initial=0.0) < _FAR:
-                break
-        return self._divide(z)
-
-    def _divide(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
-        stages = z[: self.intervals * width].reshape(self.intervals, width)
-        return np.vstack([stages[:, :ns], z[self.intervals * width :]]), stages[:, ns:].copy()
-
-
-def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """(N+1, ns) and (N, nw) as s_0, w_0, s_1, … s_N."""
-    return np.concatenate([np.hstack([states[:-1], inputs]).ravel(), states[-1]])
 
 
 def _status(solver: str, stats: dict) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.collocation import Guess, Plan, Problem, solve
 from ballbot_baselines.guess import along_path
+from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
@@ -22,6 +23,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic
 from ballbot_gym.rollout import Episode, rollout, simulate
 from ballbot_gym.tasks.orbit import steady_orbit
+from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
 
 DISTANCE_WEIGHT = 1.0  # Q0, of the squared ground distance from the destination
@@ -129,11 +131,6 @@ def hermite_guess(
     return _along(params, path, x0, x1, duration)
 
 
-def straight_guess(params: BallbotParams, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
-    """The paper's guess: a straight line from state to state, which no motion of the robot follows; duration in s."""
-    return Guess(np.linspace(x0, x1, INTERVALS + 1), np.zeros((INTERVALS + 1, 2)), duration / INTERVALS)
-
-
 def _along(params: BallbotParams, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
     """Zero forces, and states along a ground path (intervals+1, 2), m, from x0 to x1."""
     h = duration / (len(path) - 1)
@@ -224,8 +221,11 @@ def track_plan(plan: Plan, params: BallbotParams) -> tuple[Trajectory, float]:
         What was executed, and the largest distance between its path and the plan's, m.
     """
     trajectory, dt = plan.trajectory, TRACKING_DT
-    state_weights = np.diag([DISTANCE_WEIGHT, DISTANCE_WEIGHT, *[REST_WEIGHT] * 6])
-    controller = TvlqrController.for_weights(params, trajectory, dt, state_weights, EFFORT_WEIGHT * np.eye(2))
+    task = Stabilize(
+        control_dt=dt, position_weight=DISTANCE_WEIGHT, rest_weight=REST_WEIGHT, effort_weight=EFFORT_WEIGHT
+    )
+    upright = np.zeros(8), np.zeros(2), np.zeros(0)  # uniform motion upright linearizes like standing
+    controller = TvlqrController.for_task(task, params, trajectory, end=discrete_lqr(task, params, *upright))
     executed = simulate(controller, params, trajectory.x[0], round(trajectory.duration / dt) * dt, dt)
     planned = np.array([trajectory.state(t) for t in executed.t])
     return executed, float(np.hypot(*(executed.x - planned)[:, :2].T).max())

@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import righting
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.ocp import Ocp, OcpSolution, OcpSolver
 from ballbot_baselines.shooting import Backoff, kind_of, ocp_of, shooting_parameters
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -72,11 +72,11 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
 def _solve(
     solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, value: float, p: list[float]
 ) -> OcpSolution:
-    bounds = Bounds.free(solver.ocp, len(a))
+    lower, upper = solver.ocp.no_bounds(len(a))
     known = [i for i in range(8) if i != _LEAN]
-    bounds.state_lower[0, known] = bounds.state_upper[0, known] = np.where(np.array(known) == component, value, 0.0)
-    bounds.input_lower[:], bounds.input_upper[:] = -1.0, 1.0
-    return solver.solve(x, a, bounds, p)
+    lower[0, known] = upper[0, known] = np.where(np.array(known) == component, value, 0.0)
+    lower[:, x.shape[1] :], upper[:, x.shape[1] :] = -1.0, 1.0
+    return solver.solve(x, a, lower, upper, p)
 
 
 def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:

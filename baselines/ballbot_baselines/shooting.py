@@ -18,7 +18,7 @@ import numpy as np
 
 from ballbot_baselines import guess
 from ballbot_baselines.formulas import check_formulas
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.ocp import Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number
@@ -246,14 +246,14 @@ class Shooting:
         # On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits.
         tolerance = tolerance or (1e-6 if self.params.grips else 1e-8)
         made = _solver(*kind_of(self.task, self.params), free_time, n, solver, tolerance, iterations, barrier)
-        bounds = Bounds.free(made.ocp, n)
-        bounds.state_lower[0, :known] = bounds.state_upper[0, :known] = x[0, :known]
-        bounds.input_lower[:], bounds.input_upper[:] = force - 1, 1 - force
+        lower, upper = made.ocp.no_bounds(n)
+        lower[0, :known] = upper[0, :known] = x[0, :known]
+        lower[:, x.shape[1] :], upper[:, x.shape[1] :] = force - 1, 1 - force
         if free_time:
             longest = self.task.duration / n
-            bounds.state_lower[:, -1], bounds.state_upper[:, -1] = min(dt / 4, longest), longest
+            lower[:, known], upper[:, known] = min(dt / 4, longest), longest
         p = shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness, self.start)
-        return made.solve(x, a, bounds, p)
+        return made.solve(x, a, lower, upper, p)
 
     def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[OcpSolution]:
         """From a guess by fatrop, and if that fails by ipopt: all solutions, the best last.

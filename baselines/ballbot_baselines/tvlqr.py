@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from ballbot_baselines.linearize import discretize
-from ballbot_baselines.lqr import Gains, lqr_at_end, riccati, tracking_gains, weighted_lqr
+from ballbot_baselines.lqr import Gains, lqr_at_end, tracking_gains
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -33,30 +32,21 @@ class TvlqrController:
 
     @classmethod
     def for_task(
-        cls, task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray | tuple = ()
+        cls,
+        task: Task,
+        params: BallbotParams,
+        trajectory: Trajectory,
+        c: np.ndarray | tuple = (),
+        end: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> "TvlqrController":
         """With weights from the task's own cost; c (nc,) are the constants the trajectory was planned for.
 
-        Its times are the episode's.
+        Its times are the episode's. `end` is K (2, 8) and P (8, 8) where it ends; default, those of `lqr_at_end`.
         """
         c, dt = np.asarray(c, np.float64), task.control_dt
-        end_gain, p_final = lqr_at_end(task, params, trajectory.x[-1], c, trajectory.t[-1])
+        end_gain, p_final = end or lqr_at_end(task, params, trajectory.x[-1], c, trajectory.t[-1])
         gains = tracking_gains(task, params, *_sampled(trajectory, dt), c, p_final, trajectory.t[0])
         return cls(trajectory, dt, gains, end_gain)
-
-    @classmethod
-    def for_weights(
-        cls, params: BallbotParams, trajectory: Trajectory, dt: float, q: np.ndarray, r: np.ndarray
-    ) -> "TvlqrController":
-        """With constant weights, q (8, 8) and r (2, 2) per second, for plans that end upright, standing or moving.
-
-        Uniform motion upright linearizes like standing, so both end with LQR's cost-to-go.
-        """
-        upright = np.zeros(params.state_size), np.zeros(params.action_size)
-        gain, p = weighted_lqr(params, *upright, dt, q * dt, r * dt)
-        a, b = discretize(params, *_sampled(trajectory, dt), dt)
-        q, r = (np.broadcast_to(weight * dt, (len(a), *weight.shape)) for weight in (q, r))
-        return cls(trajectory, dt, riccati(a, b, q, r, p), gain)
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._start = t
