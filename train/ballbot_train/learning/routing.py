@@ -17,7 +17,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
-from ballbot_train.routes import Routes, farther_choices
+from ballbot_train.policy import Routes, farther_choices
 
 EPISODES = 60_000
 _DISTANCES = 7  # for which the motion without obstacles is found
