@@ -209,12 +209,8 @@ def track_in(name: str) -> str:
 
 
 def weights_digest(path: str | Path) -> str:
-    """SHA-256 of a policy's weights, as hexadecimal digits.
-
-    Raises:
-        PolicyError: they are missing.
-    """
-    weights, _ = paths_of(path)
+    """SHA-256 of a policy's weights, or of a saved model, as hexadecimal digits; raises a PolicyError if they are missing."""
+    weights = path if Path(path).suffix == ".zip" else paths_of(path)[0]
     try:
         return hashlib.sha256(files.read(weights)).hexdigest()
     except files.FileError as error:

@@ -5,7 +5,6 @@ SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO. Pickles, such
 code, and are not read.
 """
 
-import hashlib
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
@@ -106,27 +105,17 @@ def _in_words(space: Any) -> str:
     return f"{space.shape} {space.dtype} from {space.low.min():g} to {space.high.max():g}"
 
 
-def observations_of(path: str | Path) -> int:
-    """The size of the observations that a saved model takes; raises a PolicyError as `load_actor`."""
-    return _read(path).observations
-
-
 def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
     """Whether a saved model takes observations of a task's size.
 
     Raises:
         PolicyError: as `load_actor`; also where the size is the task's and the spaces are not.
     """
-    model = _read(path)
+    model = read(path)
     if model.observations != len(task.observation_scale):
         return False
     check_spaces(str(path), model, task, params)
     return True
-
-
-def digest(path: str | Path) -> str:
-    """SHA-256 of a saved model, as hexadecimal digits."""
-    return hashlib.sha256(files.read(path)).hexdigest()
 
 
 def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActor:
@@ -141,7 +130,7 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
-    model, size = _read(path), len(task.observation_scale)
+    model, size = read(path), len(task.observation_scale)
     if model.observations != size:
         raise PolicyError(f"{path} takes {model.observations} observations, {task.id} has {size}")
     check_spaces(str(path), model, task, params)
@@ -152,7 +141,8 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
     return SavedActor(network, model.squashed).eval()
 
 
-def _read(path: str | Path) -> Saved:
+def read(path: str | Path) -> Saved:
+    """What a file holds; raises a PolicyError as `load_actor`."""
     try:
         return _read_zip(Path(path))
     except PolicyError:

@@ -80,9 +80,9 @@ def made_for(name: str) -> str:
         PolicyError: the file is missing or damaged.
     """
     if is_saved_model(name):
-        from ballbot_train.saved_models import observations_of
+        from ballbot_train.saved_models import read
 
-        return f"a task with {observations_of(plain(name))} observations"
+        return f"a task with {read(plain(name)).observations} observations"
     spec = read_description(plain(name))["spec"]
     robot = spec.get("robot", PAPER)
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
@@ -93,12 +93,7 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
     if is_expert(name):
         return ""
     robot, name = robot if isinstance(robot, str) else robot_name(robot), plain(name)
-    path = str(shipped_policies(task, robot, None).get(name, name))
-    if is_saved_model(path):
-        from ballbot_train.saved_models import digest
-
-        return digest(path)
-    return weights_digest(path)
+    return weights_digest(shipped_policies(task, robot, None).get(name, name))
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
