@@ -150,6 +150,13 @@ def test_adaptive_nmpc_learns_robot_and_delay_in_a_second():
     assert controller.filter.delay == 2
 
 
+def test_adaptive_nmpc_passes_the_gate_in_an_engine_of_first_order():
+    """Its errors are the same in many steps on end, and no other robot explains them."""
+    row = evaluate("nmpc-adaptive", "turn", 1, "bullet", randomization="unknown")
+    assert row.success == 1
+    assert row.regret_mean < 0.05
+
+
 def test_filter_errs_less_than_half_of_what_noisy_sensors_do():
     track = TRACKS["noisy"]
     env = BallbotEnv("stabilize", physics="rk4", randomization=track)

@@ -3,7 +3,8 @@
 `TrackFilter` estimates the state, the robot and the delay, and `SensorFilter` the state of a robot with wheels. A controller
 acts on the state in which its force will begin to act, and asks for what makes up for the share of it that the robot applies.
 NMPC is told the estimated robot too. Where the estimate has moved far from the robot that the episode was planned for, the
-rest of the episode is planned anew, from the present state. That takes longer than a control step.
+rest of the episode is planned anew, from the present state. That takes longer than a control step. Shortly before a goal a
+new plan may just miss it, and go all the way round. The plan before, which tolerates some error, is followed then.
 
 What friction the floor has is not seen before the robot slips, so plans take the least of the track.
 """
@@ -23,6 +24,7 @@ from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 
 _MOVED = 0.02  # of a factor of the robot, and at least twice its deviation: then the episode is planned anew
+_LATER = 1.0  # s by which plans that go all the way round to a goal end later, and are not followed
 _NOISY_BACKOFF = Backoff(margin=0.03, goal=0.2, force=0.02, grip=0.1)  # with room for errors of the estimate
 
 _TRACKS = {
@@ -85,18 +87,26 @@ class AdaptiveNmpcController(FilteredController):
         super().__init__(task, params, ending, NmpcController(task, params, backoff=self._backoff))
 
     def _begin(self, t: float) -> None:
-        self._plan(t)
+        self._controller = self._planned(t)
 
     def _adapt(self, t: float) -> None:
         moved = np.abs(self.filter.factors - self._factors) > np.maximum(_MOVED, 2 * self.filter.deviations)
         if self.filter.delay != self._delay or moved.any():
             with contextlib.suppress(PlanError):  # the plan before is followed
-                self._plan(t)
+                planned = self._planned(t)
+                if _end(planned) < _end(self._controller) + _LATER:
+                    self._controller = planned
         self._controller.adapt(self.filter.robot)
 
-    def _plan(self, t: float) -> None:
-        """Plans the rest of the episode for the estimated robot from the state in which the next force begins to act."""
+    def _planned(self, t: float) -> NmpcController:
+        """NMPC for the estimated robot, with a plan of the rest of the episode from where the next force begins to act."""
         self._factors, self._delay = self.filter.factors, self.filter.delay
         nmpc = NmpcController(self._task, self.filter.robot, backoff=self._backoff)
         nmpc.reset(self._when_free(t), self.filter.when_free(), self._c)
-        self._controller = nmpc
+        return nmpc
+
+
+def _end(nmpc: NmpcController) -> float:
+    """When its plan ends, s."""
+    assert nmpc.plan is not None
+    return nmpc.plan.trajectory.t[-1]

@@ -31,8 +31,8 @@ _X, _FACTORS = slice(0, 8), slice(8, 11)
 _SIZE = 17
 _WIDE = 10.0  # standard deviation of the state before it is first observed, SI units
 _LEAST_NOISE = 1e-4  # of sensors, SI units: no filter converges on exact ones
-_MODEL_ERROR = 1e-3  # m/s and rad/s per control step that no robot of the track explains
-_FACTOR_WALK = 5e-3  # per control step: lets factors recover from errors of the linearization
+_MODEL_ERROR = (1e-4,) * 4 + (1e-3,) * 4  # of the state per control step, SI units: what no robot of the track explains
+_FACTOR_WALK = 1e-3  # per control step: lets factors recover from errors of the linearization
 _EVIDENCE = 3.0  # of a longer delay over a shorter one, as a difference of log-likelihoods
 
 
@@ -59,7 +59,7 @@ class TrackFilter:
         self._low, self._high = np.array([getattr(track, name) for name in ROBOT_FACTORS]).T
         errors = np.repeat((track.odometry_drift, track.lean_bias, track.lean_rate_bias), 2)
         self._prior = np.concatenate([np.full(8, _WIDE), (self._high - self._low) / np.sqrt(12), errors]) ** 2
-        self._walk = np.array([0] * 4 + [_MODEL_ERROR] * 4 + [_FACTOR_WALK] * 3 + [0] * 6) ** 2
+        self._walk = np.array([*_MODEL_ERROR, *[_FACTOR_WALK] * 3, *[0] * 6]) ** 2
         self._noise = np.diag(np.maximum(track.noise, _LEAST_NOISE)) ** 2
 
     def reset(self, x: np.ndarray, c: np.ndarray | None = None) -> None:
