@@ -254,3 +254,16 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
         for observation, action, there in zip(observations, given, turned, strict=True):
             _, back = frame.features(tuple(observation))
             np.testing.assert_allclose(REACH * np.array(back(tuple(there))), action, atol=1e-6)
+
+
+def test_last_values_of_many_episodes_at_once_are_those_that_sb3_would_add_one_by_one() -> None:
+    config = replace(ppo.TUNED["stabilize"], num_envs=32, num_steps=24, batch_size=128, hidden=(16,))
+    rewards = []
+    for together in (True, False):
+        learner = ppo.Ppo(make_task("stabilize"), default_params(), config, seed=3)
+        if not together:
+            learner._env.bootstrap = None
+        learner.iterate()
+        rewards.append(learner._model.rollout_buffer.rewards)
+    assert np.abs(rewards[0]).max() > 1.0  # a last value is many times the pay of a step
+    np.testing.assert_allclose(rewards[0], rewards[1], rtol=1e-5, atol=1e-6)

@@ -1,7 +1,7 @@
 """What PPO and SAC share: stages of training, the envs they train on, imitation, and their actors as policies."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -71,6 +71,9 @@ _WAITING_PROGRESS = 0.2  # share of their course at which schedules wait until t
 _SETTLED_LEARNING_RATE = 7e-4  # when it has come there, from where it falls to the same end
 _WARMUP_ITERATIONS = 15  # of the critic alone, after a warm start: an untrained one would undo what the actor knows
 
+
+Bootstrap = Callable[[np.ndarray], np.ndarray]
+"""From last observations (n, no) to their discounted values (n,)."""
 
 _STATE = ("iteration", "_average", "_imitation", "_settled", "_env", "_random")
 
@@ -344,6 +347,8 @@ class TrainingEnv(BallbotVecEnv):
         vector.batch = self.batch = batch
         super().__init__(vector)
         self._scale = np.float32(reward_scale)
+        self.bootstrap: Bootstrap | None = None
+        """If set, `step_wait` adds what it returns, and SB3 does not call the critic once for each episode."""
         self._frame, self._axes = frame, np.zeros(0)
         if frame is not None:
             self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)
@@ -361,11 +366,23 @@ class TrainingEnv(BallbotVecEnv):
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observation, reward, done, infos = super().step_wait()
+        reward = self._scale * reward
         if self._frame is not None:
             for i in np.flatnonzero(done).tolist():
                 last, _ = seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
                 infos[i]["terminal_observation"] = last[0]
-        return self._seen(observation), self._scale * reward, done, infos
+        if self.bootstrap is not None:
+            self._add_last_values(self.bootstrap, reward, infos)
+        return self._seen(observation), reward, done, infos
+
+    @staticmethod
+    def _add_last_values(bootstrap: Bootstrap, reward: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Adds the value of the last observation to the reward of all episodes that ran out of time, in one call."""
+        truncated = [i for i, info in enumerate(infos) if info.get("TimeLimit.truncated")]
+        if truncated:
+            reward[truncated] += bootstrap(np.stack([infos[i]["terminal_observation"] for i in truncated]))
+        for i in truncated:
+            infos[i]["TimeLimit.truncated"] = False  # so that SB3 does not add it again
 
     def state_dict(self) -> dict[str, Any]:
         """State of every env: tensors and plain values."""

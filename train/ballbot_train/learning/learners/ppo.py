@@ -252,11 +252,18 @@ class Ppo(ModelFree):
             policy.value_net.register_forward_hook(self._weigh)
         if warm:
             policy.optimizer.register_step_pre_hook(_keep_critic_rate)
+        self._env.bootstrap = self._last_values
         actor, critic = policy.branches.actor, policy.branches.critic
         self._set_model(model, actor, start, (policy.optimizer,), model.rollout_buffer, [critic.linear.bias])
 
     def _act(self, seen: torch.Tensor) -> torch.Tensor:
         return _mean(self._actor, seen)
+
+    def _last_values(self, observations: np.ndarray) -> np.ndarray:
+        """Discounted values (n,) of the last observations (n, no) of episodes that ran out of time."""
+        with torch.no_grad():
+            values = self._model.policy.predict_values(torch.as_tensor(observations))
+        return self._model.gamma * values.squeeze(-1).numpy()
 
     def _improve(self) -> dict[str, float]:
         std = schedules.geometric(self.config.std, self.config.final_std, self._progress)
