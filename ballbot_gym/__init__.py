@@ -1,24 +1,64 @@
-"""Gymnasium environments of a ballbot at high lean. Importing this package registers their ids."""
+"""Gymnasium environments of a ballbot at high lean. Importing this package registers their ids.
+
+Everything that users need is imported from here: `from ballbot_gym import BallbotEnv`. Modules inside the
+package may move; these names stay.
+"""
 
 import importlib.metadata
+from typing import TYPE_CHECKING
 
+from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.lazy import exports
+from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.paths import catmull_rom, cubic, then_stay
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import load_plugins, register_task
 from ballbot_gym.robots import named_robot, register_robot
-from ballbot_gym.tasks import SHIPPED, TASKS, Task
+from ballbot_gym.rollout import Controller, Episode, rollout
+from ballbot_gym.seeding import spawned
+from ballbot_gym.tasks import SHIPPED, TASKS, Reference, Task
+from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.orbit import Orbit
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_gym.tasks.turn import Turn
+from ballbot_gym.tasks.weave import Weave
+from ballbot_gym.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.vector import BallbotVectorEnv
 
 __all__ = [
     "TASKS",
+    "BallbotBatch",
     "BallbotEnv",
     "BallbotParams",
+    "BallbotVectorEnv",
+    "Controller",
+    "Episode",
+    "Marker",
+    "Orbit",
     "Randomization",
+    "Reference",
+    "Stabilize",
     "Task",
+    "Trajectory",
+    "Turn",
+    "Weave",
+    "catmull_rom",
+    "cubic",
+    "default_params",
     "named_robot",
+    "ops",
     "register_robot",
     "register_task",
+    "rollout",
+    "spawned",
+    "then_stay",
 ]
+
+__getattr__ = exports(__name__, {"BallbotBatch": "batch", "BallbotVectorEnv": "vector"})  # torch is imported for them
 
 try:
     __version__ = importlib.metadata.version("ballbot-gym")

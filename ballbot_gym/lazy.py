@@ -3,7 +3,7 @@
 Where a library is missing, the error names the extra that brings it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -64,3 +64,19 @@ def called(entry: str) -> Callable[..., Any]:
 
     call.__name__ = entry.rpartition(":")[2]
     return call
+
+
+def exports(package: str, entries: Mapping[str, str]) -> Callable[[str], Any]:
+    """The `__getattr__` of a package whose public names are imported when they are first used.
+
+    Args:
+        package: its `__name__`.
+        entries: from public name to the module in the package that has it, such as "optimum" or "learning.sb3".
+    """
+
+    def attribute(name: str) -> Any:
+        if name not in entries:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return load(f"{package}.{entries[name]}:{name}")
+
+    return attribute

@@ -9,11 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.guess import along_path
-from ballbot_gym import Task, ops, register_task
-from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks import Reference
+from ballbot_baselines import along_path
+from ballbot_gym import BallbotParams, Reference, Task, ops, register_task
 
 
 @register_task
@@ -33,13 +30,15 @@ class FigureEight(Task):
     clock = True
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
-        return (between(z[0], 0.8, 1.5),)
+        return (ops.between(z[0], 0.8, 1.5),)
 
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
-        px, py, gamma, theta = (between(part, -size, size) for part, size in zip(z, (0.5, 0.5, 0.2, 0.2), strict=True))
+        px, py, gamma, theta = (
+            ops.between(part, -size, size) for part, size in zip(z, (0.5, 0.5, 0.2, 0.2), strict=True)
+        )
         return (px, py, gamma, theta, 0.0 * px, 0.0 * px, 0.0 * px, 0.0 * px)
 
-    def _point(self, c: Vector) -> tuple[Any, ...]:
+    def _point(self, c: ops.Vector) -> tuple[Any, ...]:
         """Position and velocity of the point at a time, and its phase's sine and cosine: c has the time at its end."""
         width, time = ops.components(c)
         rate = 2 * math.pi / self.period
@@ -47,28 +46,30 @@ class FigureEight(Task):
         velocity = (width * rate * cosine, width * rate * (cosine * cosine - sine * sine))
         return (width * sine, width * sine * cosine), velocity, (sine, cosine)
 
-    def _errors(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+    def _errors(self, x: ops.Vector, c: ops.Vector) -> tuple[Any, ...]:
         """Position and velocity less the point's."""
         px, py, _, _, vx, vy, *_ = ops.components(x)
         (x_point, y_point), (vx_point, vy_point), _ = self._point(c)
         return (px - x_point, py - y_point), (vx - vx_point, vy - vy_point)
 
-    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+    def cost(self, x: ops.Vector, u: ops.Vector, c: ops.Vector) -> Any:
         distance, slip = self._errors(x, c)
         *_, gamma_rate, theta_rate = ops.components(x)
-        effort = 5e-4 * squared(*ops.components(u))
-        return 5.0 * squared(*distance) + 0.5 * squared(*slip) + 0.1 * squared(gamma_rate, theta_rate) + effort
+        effort = 5e-4 * ops.squared(*ops.components(u))
+        return (
+            5.0 * ops.squared(*distance) + 0.5 * ops.squared(*slip) + 0.1 * ops.squared(gamma_rate, theta_rate) + effort
+        )
 
-    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+    def goal(self, x: ops.Vector, c: ops.Vector) -> tuple[Any, ...]:
         distance, slip = self._errors(x, c)
-        return squared(*distance) / 0.3**2 - 1, squared(*slip) / 1.0**2 - 1
+        return ops.squared(*distance) / 0.3**2 - 1, ops.squared(*slip) / 1.0**2 - 1
 
-    def observe(self, x: Vector, c: Vector) -> Vector:
+    def observe(self, x: ops.Vector, c: ops.Vector) -> ops.Vector:
         _, _, *rest = ops.components(x)
         distance, slip = self._errors(x, c)
         _, _, phase = self._point(c)
         width, _ = ops.components(c)
-        return scaled((*distance, *rest, *phase, *slip, width), self.observation_scale, like=x)
+        return ops.scaled((*distance, *rest, *phase, *slip, width), self.observation_scale, like=x)
 
     def _path(self, c: np.ndarray) -> np.ndarray:
         """(steps+1, 2) where the point is at every control step."""

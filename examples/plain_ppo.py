@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 import ballbot_gym  # noqa: F401
-from ballbot_gym.seeding import spawned
+from ballbot_gym import spawned
 from ballbot_train import evaluate_fresh
 
 

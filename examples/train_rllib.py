@@ -82,8 +82,7 @@ def main(
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.tune.registry import register_env
 
-    from ballbot_gym.seeding import spawned
-    from ballbot_gym.tasks import TASKS
+    from ballbot_gym import TASKS, spawned
     from ballbot_train import evaluate, evaluate_fresh
 
     torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work

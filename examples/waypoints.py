@@ -9,13 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.guess import along_path
-from ballbot_gym import Task, ops, register_task
-from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.paths import catmull_rom
-from ballbot_gym.tasks import Reference
-from ballbot_gym.tasks.marker import Marker
+from ballbot_baselines import along_path
+from ballbot_gym import BallbotParams, Marker, Reference, Task, catmull_rom, ops, register_task
 
 
 @register_task
@@ -37,37 +32,37 @@ class Waypoints(Task):
     clock = True
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
-        return tuple(between(part, -1.5, 1.5) for part in z)
+        return tuple(ops.between(part, -1.5, 1.5) for part in z)
 
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
-        gamma, theta = (between(part, -0.2, 0.2) for part in z)
+        gamma, theta = (ops.between(part, -0.2, 0.2) for part in z)
         return (0.0 * gamma, 0.0 * gamma, gamma, theta, 0.0 * gamma, 0.0 * gamma, 0.0 * gamma, 0.0 * gamma)
 
-    def _weights(self, c: Vector) -> tuple[Any, ...]:
+    def _weights(self, c: ops.Vector) -> tuple[Any, ...]:
         """How much each point counts now, at most 1; the last one counts from its time on."""
         time = ops.components(c)[-1]
         first, second, third = ((time - i * self.interval) / self.width for i in (1, 2, 3))
         return ops.exp(-first * first), ops.exp(-second * second), 1 / (1 + ops.exp(-2 * third))
 
-    def _ways(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+    def _ways(self, x: ops.Vector, c: ops.Vector) -> tuple[Any, ...]:
         """From the ball to each point, m."""
         px, py, *_ = ops.components(x)
         x1, y1, x2, y2, x3, y3, _ = ops.components(c)
         return (x1 - px, y1 - py), (x2 - px, y2 - py), (x3 - px, y3 - py)
 
-    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+    def cost(self, x: ops.Vector, u: ops.Vector, c: ops.Vector) -> Any:
         _, _, *motion = ops.components(x)
         first, second, third = (
-            weight * squared(*way) for weight, way in zip(self._weights(c), self._ways(x, c), strict=True)
+            weight * ops.squared(*way) for weight, way in zip(self._weights(c), self._ways(x, c), strict=True)
         )
-        return 20.0 * (first + second + third) + 0.1 * squared(*motion) + 5e-4 * squared(*ops.components(u))
+        return 20.0 * (first + second + third) + 0.1 * ops.squared(*motion) + 5e-4 * ops.squared(*ops.components(u))
 
-    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+    def goal(self, x: ops.Vector, c: ops.Vector) -> tuple[Any, ...]:
         *_, way = self._ways(x, c)
         _, _, _, _, vx, vy, *_ = ops.components(x)
-        return squared(*way) / 0.3**2 - 1, squared(vx, vy) / 0.5**2 - 1
+        return ops.squared(*way) / 0.3**2 - 1, ops.squared(vx, vy) / 0.5**2 - 1
 
-    def observe(self, x: Vector, c: Vector) -> Vector:
+    def observe(self, x: ops.Vector, c: ops.Vector) -> ops.Vector:
         _, _, *motion = ops.components(x)
         first, second, third = self._ways(x, c)
         time = ops.components(c)[-1]
@@ -76,7 +71,7 @@ class Waypoints(Task):
         after = [b + one * (d - b) for b, d in zip(second, third, strict=True)]
         phase = 2 * math.pi * time / self.interval
         clock = (ops.sin(phase), ops.cos(phase), one, two, three)
-        return scaled((*ahead, *after, *motion, *clock), self.observation_scale, like=x)
+        return ops.scaled((*ahead, *after, *motion, *clock), self.observation_scale, like=x)
 
     def _path(self, start: np.ndarray, c: np.ndarray) -> np.ndarray:
         """(steps+1, 2) a smooth curve through the points."""

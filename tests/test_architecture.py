@@ -4,6 +4,13 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ballbot_baselines
+import ballbot_gym
+import ballbot_train
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("ballbot_gym", "ballbot_baselines", "ballbot_train")
@@ -168,3 +175,17 @@ def test_no_file_prints_but_the_command_line():
 
     library = [path for path in FILES if package(path) != "ballbot_train"]
     assert relative(path for path in library if prints(path)) == []
+
+
+def test_what_users_are_shown_to_import_comes_from_the_tops_of_the_packages() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs/notebooks").glob("*.ipynb")]
+    shown = {page: page.read_text() for page in [*pages, *(ROOT / "examples").glob("*.py")]}
+    deep = re.compile(r"(?:from|import) +ballbot_(?:gym|baselines|train)\.\w+")
+    assert {page.name: deep.findall(text) for page, text in shown.items() if deep.search(text)} == {}
+
+
+@pytest.mark.parametrize("package", [ballbot_gym, ballbot_baselines, ballbot_train])
+def test_every_public_name_of_a_package_is_there(package: Any) -> None:
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+    assert len({name for each in (ballbot_gym, ballbot_baselines, ballbot_train) for name in each.__all__}) <= 80

@@ -6,14 +6,17 @@ CasADi and SciPy are imported when one of them is first asked for, or a controll
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ballbot_gym.lazy import called, load, need
+from ballbot_gym.lazy import called, exports, need
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
+    from ballbot_baselines.batched import find_optima
+    from ballbot_baselines.guess import along_path
+    from ballbot_baselines.kalman import StateFromSensors
     from ballbot_baselines.lqr import LqrController
     from ballbot_baselines.measured import Regret, regret
     from ballbot_baselines.nmpc import NmpcController, offset_free_nmpc
@@ -44,17 +47,6 @@ VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 FILTERS = ("-adaptive-ekf", "-ekf", "-adaptive")
 """What may follow the name of a controller, and puts a filter in front of it; see `adaptive`."""
 
-_MODULES = {
-    "lqr": ("LqrController",),
-    "measured": ("Regret", "regret"),
-    "nmpc": ("NmpcController", "offset_free_nmpc"),
-    "optimum": ("Optimum", "find_optimum", "plan_to_track"),
-    "shooting": ("Backoff",),
-    "trajopt": ("TrajoptController",),
-    "tvlqr": ("TvlqrController",),
-}
-_LAZY = {name: f"{__name__}.{module}:{name}" for module, names in _MODULES.items() for name in names}
-
 __all__ = [
     "CONTROLLERS",
     "FILTERS",
@@ -65,16 +57,27 @@ __all__ = [
     "NmpcController",
     "Optimum",
     "Regret",
+    "StateFromSensors",
     "TrajoptController",
     "TvlqrController",
+    "along_path",
+    "find_optima",
     "find_optimum",
     "offset_free_nmpc",
     "plan_to_track",
     "regret",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return load(_LAZY[name])
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+_MODULES = {
+    "batched": ("find_optima",),
+    "guess": ("along_path",),
+    "kalman": ("StateFromSensors",),
+    "lqr": ("LqrController",),
+    "measured": ("Regret", "regret"),
+    "nmpc": ("NmpcController", "offset_free_nmpc"),
+    "optimum": ("Optimum", "find_optimum", "plan_to_track"),
+    "shooting": ("Backoff",),
+    "trajopt": ("TrajoptController",),
+    "tvlqr": ("TvlqrController",),
+}
+__getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

@@ -1,44 +1,63 @@
 """Training, evaluation and the command line `ballbot`.
 
-Short import paths that stay where they are; each imports what it needs when it is first used:
+Everything that users need is imported from here, and each name imports what it needs when it is first used:
 
 | name | what it is |
 |---|---|
-| `evaluate` | the leaderboard row of anything that acts: `ballbot_train.evaluation.evaluate.evaluate` |
-| `evaluate_fresh` | thousands of fresh episodes of a policy: `ballbot_train.evaluation.fresh.evaluate_fresh` |
-| `load_policy` | a policy file as a Controller with `predict`: `ballbot_train.policy.load_policy` |
-| `shipped_policies` | the policies that come with the package: `ballbot_train.policy_files.shipped_policies` |
-| `BallbotVecEnv` | batched environments for Stable-Baselines3: `ballbot_train.learning.sb3.BallbotVecEnv` |
-| `RegretCallback` | the regret of an SB3 model while it trains: `ballbot_train.learning.callbacks.RegretCallback` |
+| `evaluate` | the leaderboard row of anything that acts |
+| `evaluate_fresh` | thousands of fresh episodes of a policy |
+| `load_policy` | a policy file as a Controller with `predict` |
+| `shipped_policies` | the policies that come with the package |
+| `export_onnx` | a policy file as ONNX |
+| `BallbotVecEnv`, `RslVecEnv` | batched environments for Stable-Baselines3 and rsl-rl |
+| `RegretCallback` | the regret of an SB3 model while it trains |
+| `Playground` | the simulation behind `ballbot play`, for scripts |
+| `certified_replay` | certified episodes of several controllers in one picture in 3D |
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ballbot_gym.lazy import exports
 
 if TYPE_CHECKING:
-    from ballbot_train.evaluation.evaluate import evaluate as evaluate
-    from ballbot_train.evaluation.fresh import evaluate_fresh as evaluate_fresh
-    from ballbot_train.learning.callbacks import RegretCallback as RegretCallback
-    from ballbot_train.learning.sb3 import BallbotVecEnv as BallbotVecEnv
-    from ballbot_train.policy import load_policy as load_policy
-    from ballbot_train.policy_files import shipped_policies as shipped_policies
+    from ballbot_train.evaluation.evaluate import evaluate
+    from ballbot_train.evaluation.fresh import evaluate_fresh
+    from ballbot_train.learning.callbacks import RegretCallback
+    from ballbot_train.learning.rsl import RslVecEnv
+    from ballbot_train.learning.sb3 import BallbotVecEnv
+    from ballbot_train.onnx_export import export_onnx
+    from ballbot_train.play.simulation import Playground
+    from ballbot_train.policy import load_policy
+    from ballbot_train.policy_files import shipped_policies
+    from ballbot_train.report.replay import certified_replay
 
-_LAZY = {
-    "evaluate": "ballbot_train.evaluation.evaluate:evaluate",
-    "evaluate_fresh": "ballbot_train.evaluation.fresh:evaluate_fresh",
-    "load_policy": "ballbot_train.policy:load_policy",
-    "shipped_policies": "ballbot_train.policy_files:shipped_policies",
-    "BallbotVecEnv": "ballbot_train.learning.sb3:BallbotVecEnv",
-    "RegretCallback": "ballbot_train.learning.callbacks:RegretCallback",
+__all__ = [
+    "BallbotVecEnv",
+    "Playground",
+    "RegretCallback",
+    "RslVecEnv",
+    "certified_replay",
+    "evaluate",
+    "evaluate_fresh",
+    "export_onnx",
+    "load_policy",
+    "shipped_policies",
+]
+
+_MODULES = {
+    "BallbotVecEnv": "learning.sb3",
+    "Playground": "play.simulation",
+    "RegretCallback": "learning.callbacks",
+    "RslVecEnv": "learning.rsl",
+    "certified_replay": "report.replay",
+    "evaluate": "evaluation.evaluate",
+    "evaluate_fresh": "evaluation.fresh",
+    "export_onnx": "onnx_export",
+    "load_policy": "policy",
+    "shipped_policies": "policy_files",
 }
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from ballbot_gym.lazy import load
-
-    return load(_LAZY[name])
+__getattr__ = exports(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+    return sorted({*globals(), *__all__})
