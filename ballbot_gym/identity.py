@@ -30,8 +30,15 @@ def robot_digest(params: BallbotParams) -> str:
 
 
 def observation_digest(task: Task, params: BallbotParams) -> str:
-    """Digest of the observations of a task at fixed states of a robot."""
-    return digest([_rounded(task.seen(x, c)) for x, _, c in _probes(task, params)])
+    """Digest of the observations of a task at fixed states and constants.
+
+    These are not drawn by the task, so that robots with other episodes share a digest where they observe the same.
+    """
+    rng, digits = np.random.default_rng(2), []
+    for _ in range(_PROBES):
+        x, c = rng.uniform(0.1, 0.9, params.state_size), rng.uniform(1.0, 2.0, len(task.constant_names))
+        digits.append(_rounded(task.seen(x, np.asarray(task.at(c, 0.5)))))
+    return digest(digits)
 
 
 def problem_digest(task: Task, params: BallbotParams) -> str:

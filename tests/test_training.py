@@ -15,6 +15,7 @@ from resuming import goes_on_as_if_never_stopped, parameters
 
 from ballbot_baselines.optimum import Backoff
 from ballbot_gym.env import make_task
+from ballbot_gym.identity import problem_digest
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -137,7 +138,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     task, params = TASKS["stabilize"](), default_params()
     config = shac.ShacConfig(iterations=1, evaluations=1, num_envs=2, horizon=2, hidden=(4,))
     about = {"learner": "shac", "task": "stabilize"}
-    (tmp_path / "config.json").write_text(json.dumps(about))
+    (tmp_path / "config.json").write_text(json.dumps(about | {"problem": problem_digest(task, params)}))
     for content in (b"", b"garbage", b"PK\x03\x04"):
         (tmp_path / "checkpoint.pt").write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):

@@ -120,10 +120,23 @@ def check_same(held: Mapping[str, Any], wanted: Mapping[str, Any], out: Path, wh
         what: it holds, in words.
     """
     wanted = json.loads(json.dumps(dict(wanted)))
-    changed = [key for key in {**held, **wanted} if held.get(key) != wanted.get(key)]
+    changed = list(_differences(held, wanted))
     if changed:
-        said = "; ".join(f"{key} {held.get(key)!r}, not {wanted.get(key)!r}" for key in changed)
-        raise ValueError(f"{out} holds {what} of {said}; give another --out or delete the folder")
+        raise ValueError(f"{out} holds {what} of {'; '.join(changed)}; give another --out or delete the folder")
+
+
+def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any], of: str = "") -> Iterator[str]:
+    """What differs, in words; of settings that are themselves named values, only those that differ."""
+    for key in {**held, **wanted}:
+        old, new = held.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            yield from _differences(old, new, f"{key} ")
+        elif old is None and key == "problem":
+            yield "an unknown problem, because an earlier version made it"
+        elif old != new and "problem" in (key, of.strip().removesuffix("s")):
+            yield f"another {of}{key}: its episodes, costs, limits, observations or robot have changed since"
+        elif old != new:
+            yield f"{of}{key} {old!r}, not {new!r}"
 
 
 def release(out: Path, marker: str = MARKER) -> None:

@@ -7,7 +7,7 @@ from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table
 from ballbot_train.evaluation import basins as maps
-from ballbot_train.evaluation.benchmark import controllers_of, open_run, policy_digests
+from ballbot_train.evaluation.benchmark import controllers_of, open_run
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 
@@ -35,7 +35,7 @@ def basins(
     chosen = controllers_of([maps.TASK], controllers, robot)
     physics = physics_or_default(physics)
     names = chosen[maps.TASK]
-    facts = open_run(out, workers, policy_digests(chosen, robot), robot, physics=physics, points=points)
+    facts = open_run(out, workers, {robot: chosen}, robot, physics=physics, points=points)
     made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made), out / "basins.png")

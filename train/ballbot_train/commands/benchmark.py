@@ -14,7 +14,6 @@ from ballbot_train.evaluation.benchmark import (
     Group,
     controllers_of,
     open_run,
-    policy_digests,
     publish,
     run_groups,
 )
@@ -60,7 +59,7 @@ def benchmark(
         for track in randomization:
             checked_randomization(track)
         settings["tracks"] = list(randomization)
-    facts = open_run(out, workers, policy_digests(chosen, robot), robot, **settings)
+    facts = open_run(out, workers, {robot: chosen}, robot, **settings)
     if randomization:
         experts = {} if controllers else robustness.EXPERTS
         groups = robustness.groups_of(chosen, randomization, physics, robot, experts)

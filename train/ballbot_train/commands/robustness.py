@@ -11,7 +11,6 @@ from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import (
     controllers_of,
     open_run,
-    policy_digests,
     publish,
     run_groups,
 )
@@ -51,7 +50,7 @@ def robustness(
     physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
     settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
-    facts = open_run(out, workers, policy_digests(chosen, robot), robot, **settings)
+    facts = open_run(out, workers, {robot: chosen}, robot, **settings)
     results = run_groups(stressed.groups_of(chosen, stresses, physics, robot), episodes, out, workers, seed)
     rows = leaderboard(results, seed)
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}

@@ -16,7 +16,6 @@ from ballbot_train.evaluation.benchmark import (
     controllers_by_robot,
     floor,
     open_run,
-    policy_digests,
     publish,
     run_groups,
 )
@@ -76,9 +75,8 @@ def transfer(
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
     engines, episodes = [physics_or_default(one) for one in physics or (None,)], checked_episodes(episodes)
-    digests = {f"{name}/{key}": d for name, group in chosen.items() for key, d in policy_digests(group, name).items()}
     settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
-    facts = open_run(out, workers, digests, robot, **settings)
+    facts = open_run(out, workers, chosen, robot, **settings)
     groups = [
         Group(
             task,

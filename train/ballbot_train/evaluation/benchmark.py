@@ -12,6 +12,7 @@ import numpy as np
 
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.identity import problem_digest
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
@@ -81,26 +82,41 @@ def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER)
 
 
 def open_run(
-    out: Path, workers: int | Workers, policies: Mapping[str, str], robot: str = PAPER, **settings: Any
+    out: Path,
+    workers: int | Workers,
+    chosen: Mapping[str, Mapping[str, Sequence[str]]],
+    robot: str = PAPER,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Claims a folder for a run with some settings; `publish` or `jobs.release` ends the run.
 
     Args:
         out: the folder.
         workers: a number of processes, or `Workers`; they change no result.
-        policies: digests of the policies that are run, as `policy_digests` gives.
-        robot: by name.
+        chosen: the controllers that are run by task, by the robot that they were made for, as `controllers_by_robot` gives.
+        robot: on which they run, by name.
         settings: whatever else decides the results.
 
     Returns:
         The facts that the results name.
 
     Raises:
-        ValueError: the folder holds an unfinished run with other settings, policies or code; another process is using it;
-            or the seed is negative.
+        ValueError: the folder holds an unfinished run with other settings, problems, policies or code; another process is
+            using it; or the seed is negative.
     """
     check_least(0, seed=settings.get("seed", 0))
-    settings |= robot_setting(robot) | {"policies": policies}
+    policies = {
+        name if made_for == robot else f"{made_for}/{name}": digest
+        for made_for, by_task in chosen.items()
+        for name, digest in policy_digests(by_task, made_for).items()
+    }
+    problems = {
+        task if name == robot else f"{name}/{task}": problem_digest(make_task(task, name), named_robot(name))
+        for made_for, by_task in chosen.items()
+        for task in by_task
+        for name in (robot, made_for)
+    }
+    settings |= robot_setting(robot) | {"policies": policies, "problems": problems}
     facts = provenance() | settings | {"workers": Workers.of(workers).here or "a Ray cluster"}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
     return facts

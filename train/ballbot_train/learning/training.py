@@ -50,15 +50,18 @@ from ballbot_gym import certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.identity import digest, problem_digest
 from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.learning import VALIDATION_EPISODES
+from ballbot_train.learning.datasets import metadata_of
 from ballbot_train.policy import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy_files import weights_digest
 from ballbot_train.provenance import provenance
 from ballbot_train.weights import own_defaults, saved_by_torch
 
@@ -195,6 +198,11 @@ def train(
         raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
     # a command names the folder, which may have been moved or copied, and every setting is compared without it
     compared = {name: value for name, value in config.items() if name != "command"}
+    compared["problem"] = problem_digest(task, named_robot(run.robot))
+    if config.get("start") is not None:
+        compared["start_weights"] = weights_digest(config["start"])
+    if config.get("demos") is not None:
+        compared["demonstrations"] = digest(metadata_of(config["demos"]))
     jobs.claim(out, compared, _CONFIG, {"command": config.get("command"), "about": provenance()})
     try:
         run.restore()

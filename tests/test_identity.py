@@ -1,0 +1,69 @@
+"""What is continued, compared or read again is told apart by content, and not by a name."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from ballbot_gym import TASKS, Stabilize, named_robot
+from ballbot_gym.identity import observation_digest, problem_digest, robot_digest
+from ballbot_gym.robots import ROBOTS
+from ballbot_train import jobs
+from ballbot_train.evaluation.benchmark import open_run
+
+PAPER = named_robot("paper")
+
+
+@dataclass(frozen=True)
+class Dearer(Stabilize):
+    """Stabilize with another cost, under its name and with its fields."""
+
+    def cost(self, x, u, c):
+        return 1.001 * super().cost(x, u, c)
+
+
+@dataclass(frozen=True)
+class Blurred(Stabilize):
+    """Stabilize with another observation."""
+
+    def observe(self, x, c):
+        return 0.5 * super().observe(x, c)
+
+
+def named_as_stabilize(kind: type[Stabilize]) -> Stabilize:
+    kind.__name__ = "Stabilize"
+    return kind()
+
+
+def test_problems_of_one_name_differ_where_cost_observation_or_robot_differ() -> None:
+    tasks = [Stabilize(), named_as_stabilize(Dearer), named_as_stabilize(Blurred)]
+    assert len({task.problem() for task in tasks}) == 1
+    heavier = replace(PAPER, body_mass=15.1)
+    digests = [problem_digest(task, robot) for task in tasks for robot in (PAPER, heavier)]
+    assert len(set(digests)) == 6
+    assert robot_digest(PAPER) != robot_digest(heavier)
+    assert (
+        observation_digest(tasks[0], PAPER)
+        == observation_digest(tasks[1], heavier)
+        != observation_digest(tasks[2], PAPER)
+    )
+    assert problem_digest(Stabilize(), PAPER) == digests[0]
+
+
+@pytest.mark.parametrize("robot", list(ROBOTS))
+def test_every_task_of_every_robot_is_a_problem_of_its_own(robot: str) -> None:
+    digests = {problem_digest(kind(), named_robot(robot)) for kind in TASKS.values()}
+    assert len(digests) == len(TASKS)
+
+
+def test_a_run_continues_with_the_same_problem_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = {"paper": {"stabilize": ["lqr"]}}
+    open_run(tmp_path, 1, chosen, episodes=5)
+    unfinished = jobs.unfinished(tmp_path)
+    unfinished.mkdir(exist_ok=True)
+    (unfinished / "job.json").write_text("[]")
+    open_run(tmp_path, 1, chosen, episodes=5)
+    monkeypatch.setitem(TASKS, "stabilize", Dearer)
+    with pytest.raises(ValueError, match="stabilize: its episodes, costs, limits, observations or robot have changed"):
+        open_run(tmp_path, 1, chosen, episodes=5)
+    jobs.unlock(tmp_path)
