@@ -55,9 +55,14 @@ def observation_size(task: Task, params: BallbotParams, observation: str) -> int
 
 
 def observation_space(task: Task, params: BallbotParams, history: int = 0, observation: str = "state") -> spaces.Box:
-    """What a robot can observe in a task, with so many earlier observations and actions."""
+    """What a robot can observe in a task, with a number of earlier observations and actions.
+
+    Past actions lie in [−1, 1]. So the bounds tell this space from a stack of frames that has the same size.
+    """
     own = observation_size(task, params, observation)
-    return spaces.Box(-_LARGEST, _LARGEST, (own + history * (own + params.action_size),), np.float32)
+    past = np.append(np.full(own, _LARGEST), np.ones(params.action_size))
+    high = np.append(np.full(own, _LARGEST), np.tile(past, history)).astype(np.float32)
+    return spaces.Box(-high, high, dtype=np.float32)
 
 
 def samples(dt: float) -> int:

@@ -6,10 +6,14 @@ from pathlib import Path
 import pytest
 
 from ballbot_gym import TASKS, Stabilize, named_robot
+from ballbot_gym.env import make_task
 from ballbot_gym.identity import observation_digest, problem_digest, robot_digest
-from ballbot_gym.robots import ROBOTS
-from ballbot_train import jobs
+from ballbot_gym.robots import ROBOTS, Robot
+from ballbot_train import evaluate, jobs, load_policy, shipped_policies
+from ballbot_train.commands.export import export
 from ballbot_train.evaluation.benchmark import open_run
+from ballbot_train.policy import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy_files import PolicyError, PolicySpec, read_description
 
 PAPER = named_robot("paper")
 
@@ -67,3 +71,39 @@ def test_a_run_continues_with_the_same_problem_alone(tmp_path: Path, monkeypatch
     with pytest.raises(ValueError, match="stabilize: its episodes, costs, limits, observations or robot have changed"):
         open_run(tmp_path, 1, chosen, episodes=5)
     jobs.unlock(tmp_path)
+
+
+def test_a_policy_is_read_for_the_numbers_of_its_robot_and_not_for_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    light, heavy = replace(PAPER, body_mass=12.0), replace(PAPER, body_mass=30.0, force_limit=900.0)
+    monkeypatch.setitem(ROBOTS, "mine", Robot(light, {}))
+    task = Stabilize()
+    path = save_policy(tmp_path / "policy", PolicyNetwork(PolicySpec.of(task, "mine", hidden=(4,))), {})
+    load_policy(path)
+    monkeypatch.setitem(ROBOTS, "mine", Robot(heavy, {}))
+    for read in (
+        load_policy,
+        lambda path: load_network(path, task, robot=None),
+        lambda path: export(str(path), robot="mine"),
+    ):
+        with pytest.raises(PolicyError, match=r"with body_mass=12.0, force_limit=350.0, and .* body_mass=30.0"):
+            read(path)
+
+
+def test_a_policy_is_read_for_its_observation_and_not_for_its_size(tmp_path: Path) -> None:
+    spec = PolicySpec.of(named_as_stabilize(Blurred), hidden=(4,))
+    path = save_policy(tmp_path / "policy", PolicyNetwork(spec), {})
+    load_policy(path, named_as_stabilize(Blurred))
+    with pytest.raises(PolicyError, match="was trained on other observations"):
+        load_policy(path, Stabilize())
+    with pytest.raises(PolicyError, match="was trained on other observations"):
+        evaluate(path, "stabilize", 1)
+
+
+def test_shipped_policies_say_their_robot_and_observation() -> None:
+    for robot in ROBOTS:
+        for name in TASKS:
+            for path in shipped_policies(make_task(name, robot), robot, None).values():
+                spec = PolicySpec.read(read_description(path)["spec"])
+                assert spec == spec.on(make_task(name, robot), robot)

@@ -18,7 +18,7 @@ from gymnasium.wrappers import (
     RescaleAction,
 )
 from stable_baselines3 import PPO, SAC, TD3
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
@@ -209,7 +209,7 @@ def with_weights(**changes):
         (with_data(use_sde=True), "exploration by its state"),
         (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
         (with_data(policy_kwargs={"features_extractor_class": "x"}), "a network that extracts features"),
-        (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation mish, which is not read"),
+        (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation <class 'Mish"),
     ],
 )
 def test_models_that_are_damaged_or_of_another_kind_are_refused(change, message, tmp_path, capsys):
@@ -219,3 +219,38 @@ def test_models_that_are_damaged_or_of_another_kind_are_refused(change, message,
     with pytest.raises(PolicyError, match=message):
         acts(path)
     assert "executed" not in capsys.readouterr().out
+
+
+def with_history():
+    return DummyVecEnv([lambda: gymnasium.make("BallbotStabilize-v0", physics="rk4", history=4)])
+
+
+def test_a_model_that_sees_the_past_acts_alike_as_object_and_as_file(tmp_path):
+    model = louder(PPO("MlpPolicy", with_history(), policy_kwargs={"net_arch": [4]}, device="cpu"))
+    model.save(tmp_path / "model.zip")
+    rows = [evaluate(policy, "stabilize", 2, "rk4", "row") for policy in (model, tmp_path / "model.zip")]
+    assert rows[0].cost_mean == pytest.approx(rows[1].cost_mean, rel=1e-6)
+    fresh = [evaluate_fresh(policy, "stabilize", 2) for policy in (model, tmp_path / "model.zip")]
+    np.testing.assert_allclose(fresh[0].costs, fresh[1].costs, rtol=1e-5)
+
+
+def test_a_stack_of_frames_is_not_taken_for_a_history_of_the_same_size(tmp_path):
+    model = PPO("MlpPolicy", VecFrameStack(envs(), 6), policy_kwargs={"net_arch": [4]}, device="cpu")
+    assert model.observation_space.shape == with_history().observation_space.shape
+    model.save(tmp_path / "model.zip")
+    for policy in (model, tmp_path / "model.zip"):
+        with pytest.raises(PolicyError, match="may be a stack of frames"):
+            evaluate(policy, "stabilize", 1, "rk4")
+
+
+class Tanh(torch.nn.Module):
+    """A user's activation with the name of torch's."""
+
+    def forward(self, x):
+        return 0.5 * torch.tanh(x)
+
+
+def test_a_users_activation_is_not_taken_for_that_of_torch(tmp_path):
+    PPO("MlpPolicy", envs(), policy_kwargs={"activation_fn": Tanh}, device="cpu").save(tmp_path / "model.zip")
+    with pytest.raises(PolicyError, match=r"the activation .*Tanh"):
+        acts(tmp_path / "model.zip")

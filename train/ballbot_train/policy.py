@@ -16,6 +16,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
+from ballbot_gym.identity import observation_digest
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
@@ -80,6 +81,11 @@ class PolicyNetwork(torch.nn.Module):
         if spec.linear:  # so that the policy starts as its linear part
             for part in self.mlp[-1].parameters():
                 torch.nn.init.zeros_(part)
+
+    @property
+    def history(self) -> int:
+        """The number of earlier observations and actions that follow the present observation."""
+        return self.spec.history
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         raw = self.raw(observation)
@@ -223,7 +229,7 @@ class PolicyController(ActionController):
 
     def __init__(self, task: Task, params: BallbotParams, network: torch.nn.Module):
         """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
-        history = network.spec.history if isinstance(network, PolicyNetwork) else 0
+        history = getattr(network, "history", 0)
         super().__init__(task, params, self._action_for, history)
         self.network = network.eval()
         if isinstance(network, PolicyNetwork) and network.spec.informed:
@@ -290,6 +296,7 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
             f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
             "train it anew"
         )
+    _check_content(description_path, spec, task)
     observations = task.observation_size(named_robot(spec.robot))
     if spec.observations != observations:
         raise PolicyError(f"{description_path} takes {spec.observations} observations, {task.id} has {observations}")
@@ -307,6 +314,25 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
     network = PolicyNetwork(spec)
     network.load_state_dict(weights)
     return network
+
+
+def _check_content(path: Path, spec: PolicySpec, task: Task) -> None:
+    """Raises a PolicyError where another robot, or another observation, has the name of that on which a policy was trained.
+
+    Files of earlier versions hold neither, and are compared by name and size alone.
+    """
+    params = named_robot(spec.robot)
+    if spec.robot_numbers not in ("", repr(params)):
+        own, here = (set(text.split("(", 1)[1].rstrip(")").split(", ")) for text in (spec.robot_numbers, repr(params)))
+        raise PolicyError(
+            f"{path} was trained on a robot {spec.robot!r} with {', '.join(sorted(own - here))}, and the robot of this name "
+            f"has {', '.join(sorted(here - own))} here; give the robot that it was trained on, or train again"
+        )
+    if spec.observation_digest not in ("", observation_digest(task, params)):
+        raise PolicyError(
+            f"{path} was trained on other observations: {task.id} now observes other values in the same states; restore its "
+            "`observe`, or train again"
+        )
 
 
 def _read_weights(path: Path) -> dict[str, torch.Tensor]:

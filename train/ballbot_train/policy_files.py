@@ -5,12 +5,13 @@ A policy is two files: weights in `NAME.safetensors` and their description in `N
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
+from ballbot_gym.identity import observation_digest
 from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS
 from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
@@ -73,6 +74,10 @@ class PolicySpec:
     observation_version: int = OBSERVATION_VERSION
     robot: str = PAPER
     """Name in `ROBOTS` of the robot it was trained on."""
+    robot_numbers: str = ""
+    """All numbers of that robot, because two files may have one name; "" in files of earlier versions."""
+    observation_digest: str = ""
+    """`identity.observation_digest` of its task; "" in files of earlier versions."""
     history: int = 0
     """How many earlier observations and actions it sees; `history` of its env."""
     informed: bool = False
@@ -101,6 +106,9 @@ class PolicySpec:
             known = get_args(get_type_hints(PolicySpec)[name])
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
+        for name in ("robot_numbers", "observation_digest"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} must be text, not {getattr(self, name)!r:.200}")
         for name in ("linear", "odd", "centred", "informed"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be true or false, not {getattr(self, name)!r}")
@@ -157,7 +165,14 @@ class PolicySpec:
     def of(cls, task: Task, robot: str = PAPER, **fields: Any) -> "PolicySpec":
         """The spec for a task and a robot by name; fields are the others."""
         observations = task.observation_size(named_robot(robot))
-        return cls(task=task.problem(), observations=observations, robot=robot, **fields)
+        spec = cls(task=task.problem(), observations=observations, robot=robot, **fields)
+        return spec.on(task, robot)
+
+    def on(self, task: Task, robot: str) -> "PolicySpec":
+        """The same network for a robot by name."""
+        params = named_robot(robot)
+        content = {"robot_numbers": repr(params), "observation_digest": observation_digest(task, params)}
+        return replace(self, robot=robot, **content)
 
 
 def read_description(path: str | Path) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from ballbot_train.weights import checked, linear_layers, saved_by_torch
 with imports_of(__name__):
     import torch
 
-_ACTIVATIONS = {name.lower(): name for name in ("ELU", "GELU", "LeakyReLU", "ReLU", "SELU", "SiLU", "Tanh")}
+_ACTIVATIONS = ("ELU", "GELU", "LeakyReLU", "ReLU", "SELU", "SiLU", "Tanh")
 _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here
 _ON_POLICY, _OFF_POLICY = ("mlp_extractor.policy_net.", "action_net."), ("actor.latent_pi.", "actor.mu.")
 """How the names of actors' layers begin."""
@@ -53,9 +53,10 @@ class Saved(NamedTuple):
 class SavedActor(torch.nn.Module):
     """Runs a network, and brings its output into [−1, 1]."""
 
-    def __init__(self, network: torch.nn.Module, squashed: bool):
-        """Args: squashed: whether the output is, by tanh; else it is clipped."""
+    def __init__(self, network: torch.nn.Module, squashed: bool, history: int = 0):
+        """Args: squashed: whether the output is, by tanh; else it is clipped. history: as that of its env."""
         super().__init__()
+        self.history = history
         self.network, self._squashed = network, squashed
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
@@ -71,11 +72,18 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
     Raises:
         PolicyError: they differ; the message says what to evaluate instead.
     """
-    seen = observation_space(task, params, history_of(model, task))
-    own = {"observation": seen, "action": spaces.Box(-1.0, 1.0, (2,), np.float32)}
+    history = history_of(model, task, params)
+    seen = observation_space(task, params, history)
+    own = {"observation": seen, "action": spaces.Box(-1.0, 1.0, (params.action_size,), np.float32)}
     for kind, wanted in own.items():
         found = getattr(model, f"{kind}_space", None)
         if found is not None and not _alike(found, wanted):
+            if kind == "observation" and history and getattr(found, "shape", None) == wanted.shape:
+                raise PolicyError(
+                    f"{name} was trained on {wanted.shape[0]} numbers, which may be a stack of frames: past actions of an "
+                    f"env with history={history} are bounded by 1, and these are not. Give ballbot_train.evaluate a "
+                    "function that stacks the frames and calls the model, or train with history=N of this version"
+                )
             raise PolicyError(
                 f"{name} was trained on {kind}s {_in_words(found)}, and those of {task.id} are {_in_words(wanted)}. Where a "
                 "wrapper changed them, give ballbot_train.evaluate a function that does what the wrapper did, for "
@@ -83,11 +91,15 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
             )
 
 
-def history_of(model: Any, task: Task) -> int:
-    """How many earlier observations and actions a model saw in training, by the size of its observations; else 0."""
-    shape, own = getattr(getattr(model, "observation_space", None), "shape", None), len(task.observation_scale)
+def history_of(model: Any, task: Task, params: BallbotParams) -> int:
+    """The number of earlier observations and actions that a model observed, by the size of its observations; else 0.
+
+    `check_spaces` refuses other spaces of this size.
+    """
+    shape, own = getattr(getattr(model, "observation_space", None), "shape", None), task.observation_size(params)
     more = shape[0] - own if shape and len(shape) == 1 else 0
-    return more // (own + 2) if more > 0 and more % (own + 2) == 0 else 0
+    past = own + params.action_size
+    return more // past if more > 0 and more % past == 0 else 0
 
 
 def _alike(found: Any, wanted: spaces.Box) -> bool:
@@ -106,13 +118,13 @@ def _in_words(space: Any) -> str:
 
 
 def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
-    """Whether a saved model takes observations of a task's size.
+    """Whether a saved model takes observations of a task's size, with or without earlier ones.
 
     Raises:
         PolicyError: as `load_actor`; also where the size is the task's and the spaces are not.
     """
     model = read(path)
-    if model.observations != len(task.observation_scale):
+    if model.observations != _size(model, task, params):
         return False
     check_spaces(str(path), model, task, params)
     return True
@@ -130,7 +142,8 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
-    model, size = read(path), len(task.observation_scale)
+    model = read(path)
+    size = _size(model, task, params)
     if model.observations != size:
         raise PolicyError(f"{path} takes {model.observations} observations, {task.id} has {size}")
     check_spaces(str(path), model, task, params)
@@ -138,7 +151,14 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
     network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
     for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-    return SavedActor(network, model.squashed).eval()
+    return SavedActor(network, model.squashed, history_of(model, task, params)).eval()
+
+
+def _size(model: Saved, task: Task, params: BallbotParams) -> int:
+    """Numbers that an env shows to a model, with the history that the model was trained with."""
+    history = history_of(model, task, params)
+    own = task.observation_size(params)
+    return own + history * (own + params.action_size)
 
 
 def read(path: str | Path) -> Saved:
@@ -162,8 +182,10 @@ def _read_zip(path: Path) -> Saved:
     options, made_by = data.get("policy_kwargs") or {}, str(data["policy_class"].get("__module__", ""))
     extracts = any("features_extractor" in name or "lstm" in name for name in [*weights, *options])
     begins = next((start for start in (_ON_POLICY, _OFF_POLICY) if any(n.startswith(start[-1]) for n in weights)), ())
-    usual = "tanh" if begins == _ON_POLICY else "relu"
-    activation = str(options.get("activation_fn", usual)).rstrip("'>").rpartition(".")[2].rpartition("'")[2].lower()
+    usual = "Tanh" if begins == _ON_POLICY else "ReLU"
+    given = str(options.get("activation_fn", f"<class 'torch.nn.modules.activation.{usual}'>"))
+    # a class of a user may have the name of one of torch's
+    activation = given.removeprefix("<class 'torch.nn.modules.activation.").removesuffix("'>")
     unread = {
         f"a policy of {made_by or 'an unknown module':.100}": not made_by.startswith(_MODULES),
         "a network that extracts features": extracts,
@@ -179,7 +201,7 @@ def _read_zip(path: Path) -> Saved:
             "and give it to ballbot_train.evaluate"
         )
     found = (_space(data[name]) for name in ("observation_space", "action_space"))
-    return Saved(_layers(path, weights, *begins), _ACTIVATIONS[activation], usual == "relu", *found)
+    return Saved(_layers(path, weights, *begins), activation, usual == "ReLU", *found)
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:

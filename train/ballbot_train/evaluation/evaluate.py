@@ -67,7 +67,7 @@ class Predictor:
         if hasattr(model, "observation_space"):
             from ballbot_train.saved_models import check_spaces, history_of  # it imports torch
 
-            self.history = history_of(model, task)
+            self.history = history_of(model, task, params)
             check_spaces(type(model).__name__, model, task, params)
         normalization = getattr(model, "get_vec_normalize_env", lambda: None)()
         # only on-policy algorithms leave this empty where there was no VecNormalize

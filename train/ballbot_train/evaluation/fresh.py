@@ -226,7 +226,9 @@ def history_of(policy: Any, task: Task, robot: str = PAPER) -> int:
     """How many earlier observations a policy wants to see, that is given as to `as_batch_policy`."""
     if isinstance(policy, str | Path):
         policy = getattr(_controller(str(policy), task, robot), "network", None)
-    return getattr(getattr(policy, "spec", None), "history", 0)
+    if callable(getattr(policy, "predict", None)):
+        return Predictor(policy, task, named_robot(robot)).history
+    return getattr(policy, "history", 0)
 
 
 BatchPolicy = Callable[[torch.Tensor], torch.Tensor]

@@ -38,7 +38,6 @@ import signal
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -339,7 +338,7 @@ class _Run:
         return row
 
     def _save_policy(self, network: PolicyNetwork, **more: Any) -> None:
-        network.spec = replace(network.spec, robot=self.robot)
+        network.spec = network.spec.on(self.task, self.robot)
         reached = getattr(self.learner, "difficulty", {})
         about = {
             "training": self.config,
