@@ -126,7 +126,7 @@ def test_a_function_a_model_and_a_controller_that_do_the_same_cost_the_same(make
 def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
     task = make_task("stabilize")
     path = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, hidden=(8,))), {})
-    assert evaluate.evaluate(path, "stabilize", 1, "rk4").controller == path.name
+    assert evaluate.evaluate(path, "stabilize", 1, "rk4").controller == f"{path.parent.name}/{path.name}"
     assert evaluate.evaluate("lqr", "stabilize", 1, "rk4").success == 1
 
 

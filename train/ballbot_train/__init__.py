@@ -15,9 +15,7 @@ Everything that users need is imported from here, and each name imports what it 
 | `certified_replay` | certified episodes of several controllers in one picture in 3D |
 """
 
-from typing import TYPE_CHECKING
-
-from ballbot_gym.lazy import exports
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ballbot_train.evaluation.evaluate import evaluate
@@ -56,7 +54,12 @@ _MODULES = {
     "load_policy": "policy",
     "shipped_policies": "policy_files",
 }
-__getattr__ = exports(__name__, _MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    from ballbot_gym.lazy import exports  # not before it is needed: `ballbot --help` imports nothing
+
+    return exports(__name__, _MODULES)(name)
 
 
 def __dir__() -> list[str]:

@@ -130,10 +130,10 @@ def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any], of: str = "
     for key in {**held, **wanted}:
         old, new = held.get(key), wanted.get(key)
         if isinstance(old, dict) and isinstance(new, dict):
-            yield from _differences(old, new, f"{key} ")
+            yield from _differences(old, new, f"{of}{key} ")
         elif old is None and key == "problem":
             yield "an unknown problem, because an earlier version made it"
-        elif old != new and "problem" in (key, of.strip().removesuffix("s")):
+        elif old != new and (key == "problem" or of == "problems "):
             yield f"another {of}{key}: its episodes, costs, limits, observations or robot have changed since"
         elif old != new:
             yield f"{of}{key} {old!r}, not {new!r}"

@@ -17,6 +17,7 @@ from ballbot_train.console import RobotName, check_least, console, print_rows, p
 from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
 from ballbot_train.evaluation.controllers import make_controller, task_name
 from ballbot_train.executors import Workers
+from ballbot_train.names import file_part
 from ballbot_train.provenance import provenance
 
 _WORST = 10
@@ -57,7 +58,7 @@ def evaluate(
     check_least(0, optima=optima)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
-    named = f"{task}-{Path(policy).stem}" + (f"-on-{randomization}" if randomization else "")
+    named = f"{task}-{file_part(policy)}" + (f"-on-{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 

@@ -7,6 +7,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER, file_name, named_robot
 from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import FILTERED, policy_path, task_name
+from ballbot_train.names import file_part
 
 
 def export(
@@ -32,7 +33,7 @@ def export(
         robot: name of the policy's robot.
     """
     filtered = policy.endswith(FILTERED) and format == "c" and named_robot(robot).wheels is not None
-    name, policy = Path(policy).stem, policy.removesuffix(FILTERED) if filtered else policy
+    name, policy = file_part(policy), policy.removesuffix(FILTERED) if filtered else policy
     task = task_name(policy, task, robot)
     problem = make_task(task, robot)
     source = policy if (policy, format) == ("lqr", "c") else policy_path(policy, problem, robot)

@@ -75,7 +75,7 @@ def transfer(
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
     engines, episodes = [physics_or_default(one) for one in physics or (None,)], checked_episodes(episodes)
-    settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
+    settings = {"frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
     facts = open_run(out, workers, chosen, robot, **settings)
     groups = [
         Group(

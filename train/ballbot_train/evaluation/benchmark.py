@@ -23,10 +23,12 @@ from ballbot_train.console import check_least, check_names, check_some, markdown
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import as_controller, run_episodes, shown_to
-from ballbot_train.evaluation.results import Result, columns
+from ballbot_train.evaluation.results import Result, columns, with_short_names
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
+_TABLES = ("leaderboard", "tracks", "robustness", "transfer", "basins")
+"""What runs write as NAME.json when they end."""
 CHUNK = 5
 """Episodes of a job."""
 
@@ -101,8 +103,8 @@ def open_run(
         The facts that the results name.
 
     Raises:
-        ValueError: the folder holds an unfinished run with other settings, problems, policies or code; another process is
-            using it; or the seed is negative.
+        ValueError: the folder holds results, or an unfinished run, with other settings, problems, policies or code; another
+            process is using it; or the seed is negative.
     """
     check_least(0, seed=settings.get("seed", 0))
     policies = {
@@ -117,6 +119,12 @@ def open_run(
         for name in (robot, made_for)
     }
     settings |= robot_setting(robot) | {"policies": policies, "problems": problems}
+    settings["controllers"] = chosen
+    for path in (out / f"{name}.json" for name in _TABLES):
+        if path.exists():
+            about = files.read_json(path).get("about")
+            held = {key: value for key, value in about.items() if key in settings} if isinstance(about, dict) else {}
+            jobs.check_same(held, settings, out, "results")
     facts = provenance() | settings | {"workers": Workers.of(workers).here or "a Ray cluster"}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
     return facts
@@ -124,7 +132,7 @@ def open_run(
 
 def publish(out: Path, name: str, title: str, shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any]) -> None:
     """Ends a run: writes its table as NAME.md, and prints it. It has what is `shown` of each row, by header."""
-    header, table = list(shown), [[text(row) for text in shown.values()] for row in rows]
+    header, table = list(shown), [[text(row) for text in shown.values()] for row in with_short_names(rows)]
     files.write(out / f"{name}.md", markdown(header, table))
     jobs.release(out)
     print_table(title, header, table)

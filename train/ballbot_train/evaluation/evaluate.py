@@ -21,7 +21,7 @@ from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import make_controller, policy_digest
-from ballbot_train.evaluation.results import Result, Row, summarize, write_leaderboard
+from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.provenance import provenance
@@ -116,6 +116,7 @@ def evaluate(
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
+            Rows of other policies and tasks that are there already stay.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes; or a randomization with an actuator that lags, under
@@ -135,7 +136,8 @@ def evaluate(
         if out is not None:
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
             facts = provenance() | ran
-            write_leaderboard([row], results, facts, Path(out))
+            results = [*_kept(Path(out), ran, row), *results]
+            write_leaderboard(leaderboard(results), results, facts, Path(out))
             if env.params.wheels is None and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
                 who = env.physics, named[0], digest
@@ -143,6 +145,21 @@ def evaluate(
         return row
     finally:
         env.close()
+
+
+def _kept(out: Path, ran: dict[str, Any], row: Row) -> list[Result]:
+    """The results in a folder that stay when a row is written there: those of other tasks and controllers.
+
+    Raises:
+        ValueError: they are of another engine, robot or randomization, or damaged.
+    """
+    if not (out / "leaderboard.json").exists():
+        return []
+    from ballbot_train import jobs  # it needs the library of locks
+
+    about, results = read_results(out)
+    jobs.check_same({key: about.get(key) for key in ran}, ran, out, "results")
+    return [result for result in results if (result.task, result.controller) != (row.task, row.controller)]
 
 
 def shown_to(controller: Controller, env: BallbotEnv) -> BallbotEnv:
@@ -164,7 +181,8 @@ def checked_episodes(episodes: int) -> int:
 
 def _name(policy: Any) -> str:
     if isinstance(policy, str | Path):
-        return Path(policy).name
+        path = Path(policy)
+        return f"{path.parent.name}/{path.name}" if path.parent.name else path.name  # a run's folder tells its policy
     return getattr(policy, "__name__", type(policy).__name__.lower())
 
 

@@ -14,7 +14,6 @@ An .npz file holds
 """
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import file_name, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.names import file_part
 from ballbot_train.provenance import provenance
 
 GRID = 1e-8
@@ -87,13 +87,13 @@ def write_in(
         "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
     }
     joined = (np.concatenate([getattr(each, part) for each in episodes]) for part in ("lengths", "states", "actions"))
-    path = out / FOLDER / file_of(name, about["robot"], Path(controller).stem)
+    path = out / FOLDER / file_of(name, about["robot"], controller)
     return files.write(path, to_bytes(Recording(about, *joined)))
 
 
 def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
-    """Name of the file of what a controller did in a task."""
-    return f"{file_name(task, robot)}-{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-')}{ending}"
+    """Name of the file of what a controller did in a task; no two controllers share one."""
+    return f"{file_name(task, robot)}-{file_part(name)}{ending}"
 
 
 def to_bytes(recording: Recording) -> bytes:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -12,6 +12,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.display import Displayed, percent
 from ballbot_train.evaluation.statistics import interval
+from ballbot_train.names import shortened
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,7 @@ def with_interval(value: float, low: float, high: float, sign: Literal["", "+"] 
 
 TABLE: dict[str, Callable[[Row], str]] = {
     "task": lambda row: row.task,
-    "controller": lambda row: Path(row.controller).name,  # a policy may be a long path
+    "controller": lambda row: row.controller,
     "success": lambda row: f"{100 * row.success:.1f} %",
     "falls": lambda row: f"{row.falls}/{row.episodes}",
     "regret mean": lambda row: with_interval(row.regret_mean, row.regret_low, row.regret_high),
@@ -236,3 +237,9 @@ HEADER = list(TABLE)
 def cells(row: Row) -> list[str]:
     """A row as text, under `HEADER`."""
     return [text(row) for text in TABLE.values()]
+
+
+def with_short_names(rows: Sequence[Any]) -> list[Any]:
+    """Rows as tables show them: of the path of a policy's file the shortest end that tells it from the others."""
+    short = shortened(row.controller for row in rows if hasattr(row, "controller"))
+    return [replace(row, controller=short[row.controller]) if hasattr(row, "controller") else row for row in rows]

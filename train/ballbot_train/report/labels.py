@@ -27,6 +27,7 @@ def color(controller: str, i: int = 0) -> str:
 
 
 def label(controller: str) -> str:
-    """The name of a controller in figures; a policy file is named after its file."""
-    stem = Path(controller).stem
+    """The name of a controller in figures; a policy file is named after its file and the file's folder."""
+    path = Path(controller)
+    stem = f"{path.parent.name}/{path.stem}" if path.suffix and path.parent.name else path.stem
     return _CONTROLLERS.get(stem, (stem, ""))[0]
