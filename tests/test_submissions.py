@@ -152,6 +152,7 @@ def test_costs_of_the_submitter_s_are_refused(submitted, tmp_path, forge):
         ({"link": "https://github.com@b.org"}, "link must be an address"),
         ({"link": "https://"}, "link must be an address"),
         ({"task": "../../a"}, "unknown task"),
+        ({"robot": "omni"}, "omni has wheels, and recordings have no heading"),
         ({"name": "<b>mine</b>"}, "name must be of letters"),
         ({"name": "m" * 41}, "name must be text of at most 40"),
         ({"task": "os:system"}, "unknown task 'os:system'"),
@@ -319,6 +320,9 @@ def test_a_row_needs_its_submission_or_a_line_in_the_list_of_releases(submitted,
     assert unbacked(tmp_path, EPISODES) == ["turn-mine-rk4.json: the row is missing, and released.txt has it"]
     entry.write(tmp_path).rename(tmp_path / "turn-other.json")
     assert "turn-other.json: the name of the file is not that of its row" in unbacked(tmp_path, EPISODES)
+    files.write(tmp_path / "released.txt", "turn-other.json\n")
+    with pytest.raises(files.FileError, match="each line must be a digest, two spaces and the name"):
+        unbacked(tmp_path, EPISODES)
 
 
 @pytest.mark.parametrize(

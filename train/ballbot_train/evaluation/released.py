@@ -23,9 +23,15 @@ def digest_of(entry: Entry) -> str:
 
 def read_released(folder: Path = LEADERBOARD) -> dict[str, str]:
     """The digests of the rows whose submissions are in releases, by the names of the rows' files."""
-    path = folder / LIST
-    lines = files.read(path).decode().splitlines() if path.exists() else []
-    return {file: of for of, file in (line.split(maxsplit=1) for line in lines)}
+    path, listed = folder / LIST, {}
+    for line in files.read(path).decode().splitlines() if path.exists() else ():
+        of, _, file = line.partition("  ")
+        if not file or file in listed:
+            raise files.FileError(
+                f"{path}: each line must be a digest, two spaces and the name of one row's file, not {line!r}"
+            )
+        listed[file] = of
+    return listed
 
 
 def unbacked(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> list[str]:

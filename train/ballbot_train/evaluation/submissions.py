@@ -222,6 +222,10 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
     recording = recordings.read(path, content)
     facts = _checked_facts(recording.about, path)
     robot = named_robot(facts["robot"])
+    if robot.wheels is not None:
+        raise SubmissionError(
+            f"{path}: {facts['robot']} has wheels, and recordings have no heading; the board has no such robots"
+        )
     task = make_task(facts["task"], facts["robot"])
     if facts["problem"] != task.problem():
         raise SubmissionError(f"{path} is of {facts['problem']}, and the certified episodes are of {task.problem()}")
@@ -242,7 +246,7 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
 def too_good(entry: Entry) -> str:
     """Why nobody can have earned a row, "" if somebody can: it beats optima by more than its engine's difference."""
     of_episode, of_mean = LEAST_REGRET[entry.physics]
-    regrets = [0.0 if result.failure else result.cost / result.optimum - 1 for result in entry.results()]
+    regrets = [result.cost / result.optimum - 1 if result.success else 0.0 for result in entry.results()]
     worst = min(range(len(regrets)), key=regrets.__getitem__)
     where, regret, least = f"episode {worst}", regrets[worst], of_episode
     if regret >= least:
