@@ -12,7 +12,20 @@ from ballbot_gym.identity import digest
 from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries, summary, too_good, verify
 
 LIST = "released.txt"
-_VERIFIED = ("name", "link", "task", "robot", "physics", "policy", "submission", "versions", "costs", "ends")
+_VERIFIED = (
+    "name",
+    "link",
+    "task",
+    "robot",
+    "physics",
+    "policy",
+    "submission",
+    "versions",
+    "costs",
+    "ends",
+    "steered",
+    "optima",
+)
 
 
 def digest_of(entry: Entry) -> str:
