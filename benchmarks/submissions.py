@@ -124,7 +124,10 @@ class Forger:
 
     def action(self) -> None:
         actions = self.honest.actions.copy()
-        actions[self._row, self.rng.integers(2)] += self.size(2e-6, 1.0)
+        rolls = (
+            self.honest.about["robot"] == "kugle"
+        )  # less than this is within the tolerance of contact, and `steer` tries it
+        actions[self._row, self.rng.integers(2)] += self.size(2e-3 if rolls else 2e-6, 1.0)
         self.write(actions=actions)
 
     def limit(self) -> None:
