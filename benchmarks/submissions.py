@@ -1,6 +1,6 @@
 """Whether forged submissions are refused and honest ones accepted: python benchmarks/submissions.py [--forged 200].
 
-20 honest submissions of three engines are verified as they are, and as on a machine whose arithmetic differs in the last
+22 honest submissions of three engines are verified as they are, and as on a machine whose arithmetic differs in the last
 digits. Forged ones are drawn over kinds, honest submissions, episodes, steps and sizes. Prints what was refused and why, and
 ends with status 1 if a forged one was accepted or an honest one refused.
 """
@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import files, named_robot, ops
+from ballbot_gym import certified, files, named_robot, ops
 from ballbot_gym.env import make_task
 from ballbot_train import evaluate
-from ballbot_train.evaluation import recordings, submissions
+from ballbot_train.evaluation import judge, recordings, steering, submissions
 
 EPISODES = 3
 HONEST = [
@@ -34,6 +34,7 @@ HONEST += [
     (task, "sac", physics, "paper") for task in ("stabilize", "orbit") for physics in ("rk4", "bullet", "mujoco")
 ]
 HONEST += [("turn", "shac", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
+HONEST += [("stabilize", "lqr", physics, "kugle") for physics in ("bullet", "mujoco")]
 
 
 def make(folder: Path) -> list[Path]:
@@ -58,14 +59,19 @@ def other_machine(rng: np.random.Generator) -> Iterator[None]:
         return call
 
     names = ("sin", "cos", "sqrt")
-    kept, stepped = {name: getattr(ops, name) for name in names}, submissions._stepped
+    kept, stepped = {name: getattr(ops, name) for name in names}, judge.stepped
+
+    def noisy_step(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+        reached, slip = stepped(*arguments)
+        return noisy(lambda: reached)(), slip
+
     try:
         for name in names:
             setattr(ops, name, noisy(kept[name]))
-        submissions._stepped = noisy(stepped)
+        judge.stepped = noisy_step
         yield
     finally:
-        submissions._stepped = stepped
+        judge.stepped = stepped
         for name in names:
             setattr(ops, name, kept[name])
 
@@ -100,9 +106,28 @@ class Forger:
         states[begin:end, self.rng.integers(8)] += self.size(1e-3, 1e-3)
         self.write(states=states)
 
+    def steer(self) -> None:
+        """Errors in every step that each keep the tolerance of contact, and all lower the cost."""
+        h, i = self.honest, self.episode
+        task, robot = make_task(h.about["task"], h.about["robot"]), named_robot(h.about["robot"])
+        begin, done = self.first[i], int(h.lengths[: i + 1].sum())
+        states, actions = h.states[begin : begin + self.steps + 1], h.actions[done - self.steps : done]
+        c = certified.load(task, robot).constants[i]
+        pushed = np.sign(steering.costates(task, robot, states, actions, c))
+        size, changed = abs(self.size(2e-6, 1e-4)), h.states.copy()
+        for k in range(self.steps):
+            action = h.actions[done - self.steps + k][None]
+            before = np.rint(changed[begin + k] / recordings.GRID) * recordings.GRID
+            (reached,), _ = judge.stepped(h.about["physics"], robot, task, before[None], robot.force_limit * action)
+            changed[begin + k + 1] = reached - size * pushed[k]
+        self.write(states=changed)
+
     def action(self) -> None:
         actions = self.honest.actions.copy()
-        actions[self._row, self.rng.integers(2)] += self.size(2e-6, 1.0)
+        rolls = (
+            self.honest.about["robot"] == "kugle"
+        )  # less than this is within the tolerance of contact, and `steer` tries it
+        actions[self._row, self.rng.integers(2)] += self.size(2e-3 if rolls else 2e-6, 1.0)
         self.write(actions=actions)
 
     def limit(self) -> None:
@@ -124,7 +149,8 @@ class Forger:
             more = [h.states[last]]
             for _ in range(n):
                 rounded = np.rint(more[-1] / recordings.GRID) * recordings.GRID
-                more.append(submissions._stepped(h.about["physics"], robot, task, rounded[None], np.zeros((1, 2)))[0])
+                (reached,), _ = judge.stepped(h.about["physics"], robot, task, rounded[None], np.zeros((1, 2)))
+                more.append(reached)
             states = np.insert(h.states, last + 1, more[1:], 0)
             actions = np.insert(h.actions, done, np.zeros((n, 2)), 0)
         self.write(lengths=h.lengths + n * (np.arange(EPISODES) == i), states=states, actions=actions)
@@ -135,7 +161,7 @@ class Forger:
             order = order[::-1]
         states = np.split(h.states, self.first[1:])
         actions = np.split(h.actions, np.cumsum(h.lengths)[:-1])
-        joined = {
+        joined: dict[str, Any] = {
             "states": np.concatenate([states[i] for i in order]),
             "actions": np.concatenate([actions[i] for i in order]),
         }
@@ -155,6 +181,7 @@ class Forger:
             {"task": "orbit" if self.honest.about["task"] != "orbit" else "turn"},
             {"task": "os:system"},
             {"link": "javascript:alert(1)"},
+            {"link": "https://a.org/|0.00 %|"},
             {"name": "<script>"},
             {"name": "x" * 10_000},
         ]
@@ -188,7 +215,7 @@ class Forger:
         return int(self.honest.lengths[: self.episode].sum()) + self.step - 1
 
 
-KINDS = ("start", "teleport", "action", "limit", "end", "mixed", "cost", "facts", "cut", "damaged", "bomb")
+KINDS = ("start", "teleport", "steer", "action", "limit", "end", "mixed", "cost", "facts", "cut", "damaged", "bomb")
 
 
 def refusal(path: Path) -> str:

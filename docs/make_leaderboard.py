@@ -1,5 +1,9 @@
-"""Writes the tables of leaderboard.md from the rows in leaderboard/: python docs/make_leaderboard.py."""
+"""Writes the tables of leaderboard.md from the rows in leaderboard/: python docs/make_leaderboard.py [--release].
 
+With --release it first lists the rows in leaderboard/released.txt, so that the submissions beside them can move to a release.
+"""
+
+import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +14,8 @@ from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.verify import regret
 from ballbot_train.console import markdown
-from ballbot_train.evaluation import comparison
-from ballbot_train.evaluation.submissions import Entry, read_entries
+from ballbot_train.evaluation import comparison, released
+from ballbot_train.evaluation.submissions import Entry, copies, read_entries
 
 PAGE = Path(__file__).parent / "leaderboard.md"
 FILMS = Path(__file__).parent / "pictures" / "films"
@@ -49,7 +53,16 @@ def _table(entries: Sequence[Entry]) -> str:
         if entry.link:
             row = row.replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |", 1)
         table.append(f"{row} {' | '.join(_filmed(entry, episode) for episode in extremes(entry))} |")
-    return "\n".join(table) + "\n"
+    notes = [note for entry in ranked if (note := _whose_motion(entry, entries))]
+    return "\n".join([*table, *(f"\n{note}" for note in notes)]) + "\n"
+
+
+def _whose_motion(entry: Entry, others: Sequence[Entry]) -> str:
+    """A sentence if the motion is another row's or that of optima, else ""."""
+    of = [f"`{name}`" for name in copies(entry, others)]
+    if entry.optima:
+        of.append(f"the certified optimum in {entry.optima} of its episodes")
+    return f"The motion of `{entry.name}` is that of {' and '.join(of)}, to 1e-6." if of else ""
 
 
 def _filmed(entry: Entry, episode: int) -> str:
@@ -86,4 +99,8 @@ def extremes(entry: Entry) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--release", action="store_true")
+    if parser.parse_args().release:
+        released.release()
     files.write(PAGE, page())

@@ -5,13 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ballbot_baselines.lqr import discrete_lqr, equilibrium_gain
 from ballbot_gym import certified, dynamics, files, named_robot
-from ballbot_gym.engines import PHYSICS, installed_physics
+from ballbot_gym.engines import PHYSICS, installed_physics, make_simulator
 from ballbot_gym.env import make_task
 from ballbot_train import evaluate
+from ballbot_train.commands.submit import submit as submit_command
 from ballbot_train.evaluation import recordings, submissions
+from ballbot_train.evaluation.released import release, unbacked
 from ballbot_train.evaluation.results import read_results
-from ballbot_train.evaluation.submissions import SubmissionError, read_entries, submit, summary, verify
+from ballbot_train.evaluation.steering import costates
+from ballbot_train.evaluation.submissions import (
+    SubmissionError,
+    copies,
+    read_entries,
+    submit,
+    summary,
+    too_good,
+    verify,
+)
 
 EPISODES = 2
 
@@ -134,6 +146,13 @@ def test_costs_of_the_submitter_s_are_refused(submitted, tmp_path, forge):
         ({"link": "javascript:alert(1)"}, "link must be an address that begins with https://"),
         ({"link": "https://a b"}, "link must be an address"),
         ({"link": "https://a.org/) <img>"}, "link must be an address"),
+        ({"link": "https://a.org/|0.00%|"}, "link must be an address"),
+        ({"link": "https://a.org/\\"}, "link must be an address"),
+        ({"link": "https://a.org]x"}, "link must be an address"),
+        ({"link": "https://github.com@b.org"}, "link must be an address"),
+        ({"link": "https://"}, "link must be an address"),
+        ({"task": "../../a"}, "unknown task"),
+        ({"robot": "omni"}, "omni has wheels, and recordings have no heading"),
         ({"name": "<b>mine</b>"}, "name must be of letters"),
         ({"name": "m" * 41}, "name must be text of at most 40"),
         ({"task": "os:system"}, "unknown task 'os:system'"),
@@ -168,7 +187,7 @@ def test_a_folder_of_several_controllers_must_be_told_which(submitted, tmp_path)
         files.write(tmp_path / recordings.FOLDER / f"{name}.npz", recordings.to_bytes(told))
     with pytest.raises(ValueError, match="holds recordings of a, b; say which with --controller"):
         submit(tmp_path, "mine", "", tmp_path)
-    assert [path.name for path in submit(tmp_path, "mine", "", tmp_path, "b")] == ["turn-mine.npz"]
+    assert [path.name for path in submit(tmp_path, "mine", "", tmp_path, "b")] == ["turn-mine-rk4.npz"]
     with pytest.raises(ValueError, match="holds no recordings; make them with evaluate"):
         submit(tmp_path / "nothing", "mine", "", tmp_path)
 
@@ -200,6 +219,155 @@ def test_of_a_simulation_that_exploded_what_no_number_holds_is_cut_off():
     assert read.actions[0].tolist() == [2.0**36 * recordings.ACTION_GRID, -1.0]
 
 
+def attack(physics, robot, steer, steps=400):
+    """A submission of two episodes of LQR in Stabilize in whose every step an error lowers the cost."""
+    task, params = make_task("stabilize", robot), named_robot(robot)
+    known, regulator = certified.load(task, robot).first(EPISODES), equilibrium_gain(task, params)
+    assert regulator is not None
+    simulator = make_simulator(physics, params, task.control_dt)
+    x, action, slopes = [], [], np.zeros((EPISODES, steps, 8))
+    for error in (0.0, steer):
+        x, action = [], []
+        for i, (start, c) in enumerate(zip(known.states, known.constants, strict=True)):
+            states = [start]
+            for slope in slopes[i]:
+                action.append(np.clip(regulator[0] @ np.array(task.observe(states[-1], c)), -1, 1))
+                simulator.reset(tuple(states[-1]))
+                reached = np.array(simulator.step(tuple(params.force_limit * action[-1])))
+                states.append(reached - error * np.sign(slope))
+            x.append(np.array(states))
+            slopes[i] = costates(task, params, x[-1], np.array(action[-steps:]), c)
+    simulator.close()
+    about = {"task": "stabilize", "problem": task.problem(), "robot": robot, "physics": physics, "controller": "lqr"}
+    about |= {"policy": "", "versions": {}, "name": "steered", "link": ""}
+    return recordings.Recording(about, np.full(EPISODES, steps), np.concatenate(x), np.array(action))
+
+
+@pytest.mark.parametrize(("robot", "physics", "error"), [("kugle", "mujoco", 8.5e-5), ("kugle", "bullet", 3e-5)])
+def test_small_errors_of_every_step_that_together_lower_the_cost_are_refused(robot, physics, error, tmp_path):
+    if physics not in installed_physics():
+        pytest.skip(f"{physics} is not installed")
+    honest = files.write(tmp_path / "honest.npz", recordings.to_bytes(attack(physics, robot, 0.0)))
+    entry = verify(honest, EPISODES)
+    assert (entry.success, entry.steered) == (1.0, 1e-4)
+    steered = files.write(tmp_path / "steered.npz", recordings.to_bytes(attack(physics, robot, error)))
+    with pytest.raises(
+        SubmissionError, match=r"episode 0: the small errors .* changed its cost by \d.*0\.01% is allowed"
+    ):
+        verify(steered, EPISODES)
+
+
+def test_a_costate_is_the_slope_of_the_cost_of_a_motion_that_is_steered_back():
+    """LQR's cost-to-go is xᵀPx near rest, and its slope is 2Px."""
+    task, params = make_task("stabilize"), named_robot("paper")
+    k, p = discrete_lqr(task, params, np.zeros(8), np.zeros(2), np.zeros(0))
+    states, forces = [np.array([1e-3, 0, 0, 1e-4, 0, 0, 0, 0])], []
+    for _ in range(task.steps):
+        forces.append(-k @ states[-1])
+        states.append(dynamics.step(params, states[-1][None], forces[-1][None], task.control_dt, 4)[0])
+    slopes = costates(task, params, np.array(states), np.array(forces) / params.force_limit, np.zeros(0))
+    expected = 2 * p @ states[10]
+    np.testing.assert_allclose(slopes[9], expected, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("physics", ["bullet", "mujoco"])
+def test_a_ball_that_slips_within_a_step_is_refused(physics, tmp_path):
+    """The verifier starts each step with a ball that rolls, so every step alone could follow."""
+    if physics not in installed_physics():
+        pytest.skip(f"{physics} is not installed")
+    params, known = named_robot("rolling"), certified.load("stabilize", "rolling").first(EPISODES)
+    simulator, states = make_simulator(physics, params, 0.02), []
+    for start in known.states:
+        states.append(start)
+        for _ in range(3):
+            simulator.reset(tuple(states[-1]))
+            states.append(np.array(simulator.step((params.force_limit, 0.0))))
+    simulator.close()
+    about = attack("rk4", "rolling", 0.0, 1).about | {"physics": physics}
+    recording = recordings.Recording(about, np.full(EPISODES, 3), np.array(states), np.tile([1.0, 0.0], (6, 1)))
+    with pytest.raises(SubmissionError, match=r"episode 0, step 1: the ball slips at \d.* m/s"):
+        verify(files.write(tmp_path / "slips.npz", recordings.to_bytes(recording)), EPISODES)
+
+
+def test_costs_below_what_the_engine_explains_are_refused(submitted):
+    entry = verify(submitted()[1], EPISODES)
+    assert too_good(entry) == ""
+    optima = [result.optimum for result in entry.results()]
+    assert "episode 0 costs 50.000% less than the optimum" in too_good(replace(entry, costs=[optima[0] / 2, optima[1]]))
+    little = replace(entry, physics="bullet", costs=[0.995 * cost for cost in optima])
+    assert "the mean of all episodes costs 0.500% less" in too_good(replace(little, **summary(little)))
+
+
+def test_a_row_needs_its_submission_or_a_line_in_the_list_of_releases(submitted, tmp_path):
+    entry = verify(submitted()[1], EPISODES)
+    row, submission = entry.write(tmp_path), tmp_path / "turn-mine-rk4.npz"
+    (missing,) = unbacked(tmp_path, EPISODES)
+    assert missing.startswith("turn-mine-rk4.json: no submission lies beside it")
+    files.write(submission, submitted()[1].read_bytes())
+    assert unbacked(tmp_path, EPISODES) == []
+    release(tmp_path, EPISODES)
+    submission.unlink()
+    assert unbacked(tmp_path, EPISODES) == []
+    replace(entry, link="https://example.org/other").write(tmp_path)
+    assert unbacked(tmp_path, EPISODES) == ["turn-mine-rk4.json: it is not the row that released.txt has"]
+    with pytest.raises(ValueError, match="it is not the row"):
+        release(tmp_path, EPISODES)
+    replace(entry, regret_mean=-0.5).write(tmp_path)
+    assert unbacked(tmp_path, EPISODES) == [
+        "turn-mine-rk4.json: its success, falls or regret are not those of its episodes"
+    ]
+    row.unlink()
+    assert unbacked(tmp_path, EPISODES) == ["turn-mine-rk4.json: the row is missing, and released.txt has it"]
+    entry.write(tmp_path).rename(tmp_path / "turn-other.json")
+    assert "turn-other.json: the name of the file is not that of its row" in unbacked(tmp_path, EPISODES)
+    files.write(tmp_path / "released.txt", "turn-other.json\n")
+    with pytest.raises(files.FileError, match="each line must be a digest, two spaces and the name"):
+        unbacked(tmp_path, EPISODES)
+
+
+@pytest.mark.parametrize(
+    "change", [{"task": "os:system"}, {"link": "https://a.org/|x|"}, {"costs": ["1"]}, {"ends": ["<b>"] * EPISODES}]
+)
+def test_rows_that_were_not_verified_are_not_read(change, submitted, tmp_path):
+    replace(verify(submitted()[1], EPISODES), **change).write(tmp_path)
+    with pytest.raises(files.FileError, match=r"unknown task|link must|costs must be numbers|unknown end"):
+        read_entries(tmp_path)
+
+
+def test_a_refused_submission_replaces_and_removes_nothing(submitted, tmp_path):
+    folder, out = submitted()[0], tmp_path / "out"
+    earlier = files.write(out / "turn-mine-rk4.npz", b"earlier")
+    with pytest.raises(SubmissionError, match="holds 2 episodes, and not 200"):
+        submit_command(folder, name="mine", out=out)
+    assert earlier.read_bytes() == b"earlier"
+    (path,) = (folder / recordings.FOLDER).glob("*.npz")
+    elsewhere = replace(recordings.read(path), about=recordings.read(path).about | {"task": "../../elsewhere"})
+    files.write(tmp_path / "run" / recordings.FOLDER / "a.npz", recordings.to_bytes(elsewhere))
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SubmissionError, match=r"unknown task '\.\./\.\./elsewhere'"):
+        submit(tmp_path / "run", "mine", "", out)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_row_says_whose_motion_it_is(submitted, tmp_path):
+    entry = verify(submitted()[1], EPISODES)
+    assert entry.optima == 0
+    other = replace(entry, name="other", costs=[cost * (1 + 1e-7) for cost in entry.costs])
+    assert copies(entry, [entry, other, replace(other, physics="bullet")]) == ["other"]
+    assert copies(entry, [replace(other, costs=[cost * 1.001 for cost in entry.costs])]) == []
+    known = certified.load("turn", "paper", episodes=range(EPISODES))
+    optima = [known.trajectories[i] for i in range(EPISODES)]
+    honest = recordings.read(submitted()[1])
+    replayed = replace(
+        honest,
+        lengths=np.array([len(optimum.u) for optimum in optima]),
+        states=np.concatenate([optimum.x for optimum in optima]),
+        actions=np.concatenate([optimum.u for optimum in optima]) / named_robot("paper").force_limit,
+    )
+    entry = verify(files.write(tmp_path / "optima.npz", recordings.to_bytes(replayed)), EPISODES)
+    assert entry.optima == EPISODES
+
+
 ENTRIES = read_entries()
 
 
@@ -210,11 +378,9 @@ def test_a_row_of_the_leaderboard_says_what_its_episodes_say(entry):
     assert summary(entry) == {name: getattr(entry, name) for name in summary(entry)}
 
 
-@pytest.mark.parametrize("path", sorted(submissions.LEADERBOARD.glob("*.npz")), ids=lambda path: path.name)
-def test_a_submission_beside_its_row_is_verified(path):
-    """A pull request brings both. This takes seconds for each."""
-    entry = verify(path)
-    assert entry in ENTRIES, f"ballbot verify {path} --write leaderboard"
+def test_every_row_is_backed_by_a_submission_beside_it_or_in_a_release():
+    """A pull request brings both. This takes seconds for each submission."""
+    assert unbacked() == []
 
 
 @pytest.mark.parametrize("task", ["stabilize", "turn"])

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from ballbot_gym import files
 from ballbot_train.commands.verify import print_entries
 from ballbot_train.console import console
 from ballbot_train.evaluation import submissions
@@ -19,13 +20,10 @@ def submit(
         controller: which one, where the folder has several.
         out: folder of the submissions.
     """
-    paths = submissions.submit(results, name, link, out, controller)
-    try:
-        entries = [submissions.verify(path) for path in paths]
-    except ValueError:
-        for path in paths:
-            path.unlink()
-        raise
+    packed = submissions.pack(results, name, link, controller)
+    # all are verified before one is written, so that a refused one replaces nothing
+    entries = [submissions.verify(out / file, content=content) for file, content in packed.items()]
+    paths = [files.write(out / file, content) for file, content in packed.items()]
     print_entries(entries)
     for path in paths:
         console.print(f"submission: {path}, {path.stat().st_size / 2**20:.2f} MiB")

@@ -49,6 +49,12 @@ def print_entries(entries: Sequence[submissions.Entry]) -> None:
                 for entry in entries
             ],
         )
+    known = submissions.read_entries() if entries else []
+    for entry in entries:
+        if of := submissions.copies(entry, known):
+            console.print(f"{entry.name}: the costs are those of {', '.join(of)} to 1e-6; is it the same motion?")
+        if entry.optima:
+            console.print(f"{entry.name}: {entry.optima} episodes are the certified optimal motions to 1e-6")
 
 
 def regret(entry: submissions.Entry) -> str:

@@ -3,36 +3,33 @@
 A submission is a recording of all certified episodes with a name and a link. `verify` starts every episode at its certified
 start. From each recorded state it takes one control step with the recorded action, and the next recorded state must follow.
 So it holds on any machine, though the motion as a whole is unstable. Costs, ends and regret are computed from the motion.
+What the small errors of all steps can have changed in the cost is bounded too.
 """
 
 import hashlib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
 import ballbot_train
-from ballbot_gym import certified, dynamics, files
-from ballbot_gym.engines import PHYSICS, make_simulator
+from ballbot_gym import certified, files
+from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
-from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.transition import limit_names, outcome
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.transition import limit_names
 from ballbot_train.evaluation import recordings
+from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError, judged
 from ballbot_train.evaluation.results import Result, read_results, summarize, to_json
 
-TOLERANCE = 1e-6
-"""Largest difference of a recorded state from the one that follows, m, rad and per second, where the state is all that
-decides. Rounding to the grids makes at most 1.2e-7 of it. As a force it is 1e-4 N, so nobody can steer with it."""
-CONTACT_TOLERANCE = 1e-4
-"""The same where an engine simulates the contact of a rolling ball; as a force 0.01 N. Each step then starts with a ball that
-rolls without slipping, which honest motions in grip keep within 1e-5. A ball that slips has a spin that none holds."""
+LEAST_REGRET = {"rk4": (-1e-3, -1e-4), "bullet": (-0.01, -0.002), "mujoco": (-0.01, -0.002)}
+"""Of an episode, and of the mean of a row: what the engine's difference from the optimum's closed form explains."""
 
 _IN_WHEEL = Path(ballbot_train.__file__).parent / "leaderboard"
 LEADERBOARD = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_WHEEL.parents[2] / "leaderboard"
@@ -50,11 +47,8 @@ _LENGTHS = {
 }
 _NAME = re.compile(r"\w[\w .+()-]*", flags=re.ASCII)
 _VERSION = re.compile(r"[\w.+-]{1,60}", flags=re.ASCII)
-_SUCCESS, _MISSED, _NO_PLAN = "success", "missed", "no plan"
-
-
-class SubmissionError(ValueError):
-    """A submission that is refused; the message says where and why."""
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?(:[0-9]{1,5})?")
+_LINK = re.compile(r"[\w.~:/?#@!$&'*+,;=%-]+", flags=re.ASCII)  # a cell of a table ends at | and a link at ) or ]
 
 
 @dataclass(frozen=True)
@@ -82,6 +76,10 @@ class Entry:
     regret_low: float | None = None
     regret_high: float | None = None
     regret_median: float | None = None
+    steered: float | None = None
+    """No more than this part of an episode's cost can be due to errors of the recording; null where nobody checked it."""
+    optima: int = 0
+    """How many episodes are the certified optimal motions to 1e-6, of those whose optimal motions are known."""
 
     def results(self) -> list[Result]:
         """Its episodes, beside the certified optima as they are now."""
@@ -94,8 +92,8 @@ class Entry:
                 physics=self.physics,
                 cost=cost,
                 optimum=float(optima[i]),
-                success=end == _SUCCESS,
-                failure=end not in (_SUCCESS, _MISSED),
+                success=end == SUCCESS,
+                failure=end not in (SUCCESS, MISSED),
             )
             for i, (cost, end) in enumerate(zip(self.costs, self.ends, strict=True))
         ]
@@ -121,13 +119,28 @@ def read_entries(folder: Path = LEADERBOARD) -> list[Entry]:
     for path in sorted(folder.glob("*.json")):
         try:
             entry = Entry(**files.read_json(path))
-            wrong = _wrong_name(entry.name, entry.link)
         except TypeError as error:
             raise files.FileError(f"{path} holds no row of a leaderboard: {error}") from error
-        if wrong:
+        if wrong := _wrong_row(entry):
             raise files.FileError(f"{path}: {wrong}")
         entries.append(entry)
     return entries
+
+
+def _wrong_row(entry: Entry) -> str:
+    """What is wrong with a row as a file states it, before anything else reads it; "" if nothing."""
+    costs, ends = entry.costs, entry.ends
+    lists = isinstance(costs, list) and isinstance(ends, list) and len(costs) == len(ends) <= certified.EPISODES
+    if not lists or not all(isinstance(cost, int | float) and math.isfinite(cost) for cost in costs):
+        return f"costs and ends must be lists of one length, at most {certified.EPISODES}, and costs must be numbers"
+    stated = {name: value for name, value in asdict(entry).items() if name in _FACTS}
+    if wrong := _wrong_facts(stated):
+        return wrong
+    if not isinstance(entry.submission, str) or not re.fullmatch("[0-9a-f]{64}", entry.submission):
+        return "submission must be a SHA-256"
+    known = {SUCCESS, MISSED, NO_PLAN, *limit_names(make_task(entry.task, entry.robot), named_robot(entry.robot))}
+    unknown = [end for end in ends if end not in known]
+    return f"unknown end {unknown[0]!r}; known: {', '.join(sorted(known))}" if unknown else ""
 
 
 def read_run(source: Path) -> tuple[dict[str, Any], list[Result]]:
@@ -159,10 +172,18 @@ def submit(results: Path, name: str, link: str, out: Path, controller: str = "")
         controller: which one, where the folder has several.
 
     Raises:
+        SubmissionError: what a recording says about itself is wrong.
         ValueError: there is no recording in it, or one of several controllers.
     """
-    found = [recordings.read(path) for path in sorted((results / recordings.FOLDER).glob("*.npz"))]
-    names = list(dict.fromkeys(recording.about["controller"] for recording in found))
+    packed = pack(results, name, link, controller)
+    return [files.write(out / file, content) for file, content in packed.items()]
+
+
+def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str, bytes]:
+    """The submissions that `submit` writes, by file name. Arguments and errors are those of `submit`."""
+    paths = sorted((results / recordings.FOLDER).glob("*.npz"))
+    found = [(path, recordings.read(path)) for path in paths]
+    names = list(dict.fromkeys(str(recording.about.get("controller")) for _, recording in found))
     if not found:
         raise ValueError(
             f"{results} holds no recordings; make them with evaluate(policy, task, out=...) or ballbot benchmark, without "
@@ -170,42 +191,93 @@ def submit(results: Path, name: str, link: str, out: Path, controller: str = "")
         )
     if (controller or len(names) > 1) and controller not in names:
         raise ValueError(f"{results} holds recordings of {', '.join(names)}; say which with --controller")
-    written = []
-    for recording in found:
-        if recording.about["controller"] == (controller or names[0]):
-            about = recording.about | {"name": name, "link": link}
-            path = out / recordings.file_of(about["task"], about["robot"], name)
-            written.append(files.write(path, recordings.to_bytes(replace(recording, about=about))))
-    return written
+    packed: dict[str, bytes] = {}
+    for path, recording in found:
+        if recording.about.get("controller") == (controller or names[0]):
+            about = _checked_facts(recording.about | {"name": name, "link": link}, path)
+            row = Entry(**{key: about[key] for key in _FACTS}, submission="", costs=[], ends=[])
+            file = Path(row.file).with_suffix(".npz").name  # so it can lie beside its row
+            if file in packed:
+                raise SubmissionError(
+                    f"{results} holds two recordings for {file}; evaluate each into a folder of its own"
+                )
+            packed[file] = recordings.to_bytes(replace(recording, about=about))
+    return packed
 
 
-def verify(path: str | Path, episodes: int = certified.EPISODES) -> Entry:
+def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes | None = None) -> Entry:
     """The leaderboard row of a submission, computed from its motion alone.
 
     Args:
         path: the file.
         episodes: how many it must hold.
+        content: what it will hold, if it is not written yet.
 
     Raises:
         SubmissionError: it breaks a rule; the message names the episode, the control step and the reason.
         FileError: as `recordings.read`.
         ImportError: its physics is not installed.
     """
-    content = files.read(path, recordings.LARGEST_FILE)
+    content = files.read(path, recordings.LARGEST_FILE) if content is None else content
     recording = recordings.read(path, content)
     facts = _checked_facts(recording.about, path)
     robot = named_robot(facts["robot"])
+    if robot.wheels is not None:
+        raise SubmissionError(
+            f"{path}: {facts['robot']} has wheels, and recordings have no heading; the board has no such robots"
+        )
     task = make_task(facts["task"], facts["robot"])
     if facts["problem"] != task.problem():
         raise SubmissionError(f"{path} is of {facts['problem']}, and the certified episodes are of {task.problem()}")
     if len(recording.lengths) != episodes:
         raise SubmissionError(f"{path} holds {len(recording.lengths)} episodes, and not {episodes}")
     known = certified.load(task, robot, episodes=range(episodes))
-    costs, ends = _judged(_Steps(recording, path), facts["physics"], task, robot, known)
+    steps = Steps(recording, path)
+    costs, ends = judged(steps, facts["physics"], task, robot, known)
     rounded = [float(f"{cost:.9g}") for cost in costs]  # more digits differ between machines
     digest = hashlib.sha256(content).hexdigest()
     entry = Entry(**{key: facts[key] for key in _FACTS}, submission=digest, costs=rounded, ends=ends)
-    return replace(entry, **summary(entry))
+    entry = replace(entry, **summary(entry), steered=STEERED, optima=_optimal_motions(steps, known))
+    if why := too_good(entry):
+        raise SubmissionError(f"{path}: {why}")
+    return entry
+
+
+def too_good(entry: Entry) -> str:
+    """Why nobody can have earned a row, "" if somebody can: it beats optima by more than its engine's difference."""
+    of_episode, of_mean = LEAST_REGRET[entry.physics]
+    regrets = [result.cost / result.optimum - 1 if result.success else 0.0 for result in entry.results()]
+    worst = min(range(len(regrets)), key=regrets.__getitem__)
+    where, regret, least = f"episode {worst}", regrets[worst], of_episode
+    if regret >= least:
+        where, regret, least = "the mean of all episodes", entry.regret_mean or 0.0, of_mean
+    if regret >= least:
+        return ""
+    return (
+        f"{where} costs {-regret:.3%} less than the optimum, and {entry.physics} explains at most {-least:.3%}. "
+        "If you found a better optimum, open an issue with the recording"
+    )
+
+
+def copies(entry: Entry, others: Iterable[Entry]) -> list[str]:
+    """Names of the rows whose motions these are, as far as costs tell: half of the episodes or more agree to 1e-6."""
+    same = []
+    for other in others:
+        board = (other.task, other.robot, other.physics) == (entry.task, entry.robot, entry.physics)
+        if board and other.name != entry.name and len(other.costs) == len(entry.costs):
+            near = np.isclose(entry.costs, other.costs, rtol=1e-6, atol=0)
+            moved = np.array(entry.ends) != NO_PLAN
+            if 2 * np.count_nonzero(near & moved & (np.array(entry.ends) == other.ends)) >= len(near):
+                same.append(other.name)
+    return same
+
+
+def _optimal_motions(steps: Steps, known: certified.EvaluationSet) -> int:
+    count = 0
+    for trajectory, first, n in zip(known.trajectories, steps.first, steps.lengths, strict=False):
+        states = steps.states[first : first + n + 1]
+        count += states.shape == trajectory.x.shape and bool(np.abs(states - trajectory.x).max() <= 1e-6)
+    return count
 
 
 def summary(entry: Entry) -> dict[str, Any]:
@@ -220,27 +292,33 @@ _FACTS = ("name", "link", "task", "robot", "physics", "policy", "versions")
 
 
 def _checked_facts(about: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    def refuse(why: str) -> NoReturn:
-        raise SubmissionError(f"{path}: {why}")
-
     if wrong := about.keys() ^ (_LENGTHS.keys() | {"versions"}):
-        refuse(f"about must hold {', '.join(_LENGTHS)} and versions; it lacks or adds {', '.join(sorted(wrong))[:200]}")
-    for key, length in _LENGTHS.items():
-        if not isinstance(about[key], str) or len(about[key]) > length:
-            refuse(f"{key} must be text of at most {length} characters")
+        why = f"about must hold {', '.join(_LENGTHS)} and versions; it lacks or adds {', '.join(sorted(wrong))[:200]}"
+    else:
+        why = _wrong_facts(about)
+    if why:
+        raise SubmissionError(f"{path}: {why}")
+    return dict(about)
+
+
+def _wrong_facts(about: Mapping[str, Any]) -> str:
+    """What is wrong with facts of a submission or of a row; "" if nothing. Nothing is imported."""
+    for key in about.keys() - {"versions"}:
+        if not isinstance(about[key], str) or len(about[key]) > _LENGTHS[key]:
+            return f"{key} must be text of at most {_LENGTHS[key]} characters"
     if wrong := _wrong_name(about["name"], about["link"]):
-        refuse(wrong)
+        return wrong
     if not re.fullmatch(r"([0-9a-f]{64})?", about["policy"]):
-        refuse("policy must be a SHA-256, or empty")
+        return "policy must be a SHA-256, or empty"
     for key, names in (("task", TASKS), ("robot", ROBOTS), ("physics", PHYSICS)):
         if about[key] not in names:  # a name with a colon would import a module
-            refuse(f"unknown {key} {about[key]!r}; known: {', '.join(names)}")
+            return f"unknown {key} {about[key]!r}; known: {', '.join(names)}"
     versions = about["versions"]
     if not isinstance(versions, dict) or len(versions) > 10:
-        refuse("versions must be an object of at most ten")
+        return "versions must be an object of at most ten"
     if not all(isinstance(part, str) and _VERSION.fullmatch(part) for pair in versions.items() for part in pair):
-        refuse("versions must be short words by name")
-    return dict(about)
+        return "versions must be short words by name"
+    return ""
 
 
 def _wrong_name(name: str, link: str) -> str:
@@ -249,92 +327,7 @@ def _wrong_name(name: str, link: str) -> str:
         return f"name must be of letters, digits, spaces and . + ( ) - _, not {name!r}"
     try:
         parts = urlsplit(link)
-        right = parts.scheme in ("http", "https") and parts.hostname and re.fullmatch(r"[!#-\'*-;=?-~]+", link)
+        right = parts.scheme in ("http", "https") and _HOST.fullmatch(parts.netloc) and _LINK.fullmatch(link)
     except ValueError:
         right = False
     return "" if right or not link else f"link must be an address that begins with https:// or http://, not {link!r}"
-
-
-class _Steps:
-    """All control steps of a recording in turn: episode and number (from 1) of each, the states around it and its action."""
-
-    def __init__(self, recording: recordings.Recording, path: str | Path):
-        self.path, self.lengths = path, recording.lengths
-        rows = recording.lengths + (recording.lengths > 0)
-        self.first = np.cumsum(rows) - rows
-        self.episode = np.repeat(np.arange(len(rows)), recording.lengths)
-        self.step = np.arange(len(self.episode)) - (np.cumsum(self.lengths) - self.lengths)[self.episode] + 1
-        before = self.first[self.episode] + self.step - 1
-        self.states, self.before, self.after = recording.states, recording.states[before], recording.states[before + 1]
-        self.action = recording.actions
-
-    def refuse(self, where: np.ndarray, why: Any) -> None:
-        """Refuses the recording if a condition holds of any step; `why` gives the reason of the first."""
-        if where.any():
-            i = int(np.argmax(where))
-            raise SubmissionError(f"{self.path}: episode {self.episode[i]}, step {self.step[i]}: {why(i)}")
-
-
-def _judged(
-    steps: _Steps, physics: str, task: Task, robot: BallbotParams, known: certified.EvaluationSet
-) -> tuple[list[float], list[str]]:
-    """Cost and end of every episode of a recording that breaks no rule."""
-    _check_starts(steps, known)
-    longest = steps.lengths[steps.episode] > task.steps
-    steps.refuse(longest, lambda i: f"the episode is longer than its {task.steps} control steps")
-    steps.refuse(
-        np.abs(steps.action).max(1) > 1, lambda i: f"the action {steps.action[i].tolist()} is beyond its limit of 1"
-    )
-    force = robot.force_limit * steps.action
-    simulated = robot.rolls and physics != "rk4"
-    tolerance = CONTACT_TOLERANCE if simulated else TOLERANCE
-    missed = np.abs(_stepped(physics, robot, task, steps.before, force) - steps.after)
-    steps.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated))
-    c = known.constants[steps.episode]
-    limits = dynamics.limits(robot, steps.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
-    grip = (np.minimum.reduce(limits),) if limits else ()
-    did = outcome(task, steps.before, force, steps.after, c, steps.step, grip)
-    over = np.broadcast_to(did.terminated + did.truncated > 0, steps.step.shape)
-    last = steps.step == steps.lengths[steps.episode]
-    steps.refuse(over & ~last, lambda i: "the episode has ended here, and the recording goes on")
-    steps.refuse(last & ~over, lambda i: "the recording stops here, and the episode has not ended")
-    n = len(steps.lengths)
-    cost = np.bincount(steps.episode, np.broadcast_to(did.cost, steps.step.shape), n)
-    cost[steps.lengths == 0] = task.survival_pay
-    ends, names = [_NO_PLAN] * n, limit_names(task, robot)
-    for i in np.flatnonzero(last):
-        violated = int(did.violated[i])
-        ends[steps.episode[i]] = names[violated] if violated >= 0 else _SUCCESS if did.success[i] > 0 else _MISSED
-    return cost.tolist(), ends
-
-
-def _check_starts(steps: _Steps, known: certified.EvaluationSet) -> None:
-    begun = np.flatnonzero(steps.lengths)
-    starts = np.rint(steps.states[steps.first[begun]] / recordings.GRID)
-    wrong = begun[(starts != np.rint(known.states[begun] / recordings.GRID)).any(1)]
-    if len(wrong):
-        raise SubmissionError(f"{steps.path}: episode {wrong[0]}, step 0: it does not begin at its certified start")
-
-
-def _stepped(physics: str, robot: BallbotParams, task: Task, before: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """The states (n, 8) one control step after others."""
-    dt = task.control_dt
-    if physics == "rk4":
-        return dynamics.step(robot, before, force, dt, dynamics.substeps_for(dt))
-    simulator, reached = make_simulator(physics, robot, dt), np.empty_like(before)
-    try:
-        for i, (x, u) in enumerate(zip(before.tolist(), force.tolist(), strict=True)):
-            simulator.reset(tuple(x))
-            reached[i] = simulator.step(tuple(u))
-    finally:
-        simulator.close()
-    return reached
-
-
-def _jump(missed: np.ndarray, tolerance: float, contact: bool) -> str:
-    """What is wrong with a step whose end is missed by so much."""
-    i = int(np.argmax(np.where(np.isfinite(missed), missed, np.inf)))
-    quantity, unit = dynamics.STATE[i]
-    slips = ". Balls that slip cannot be verified; record with physics rk4, where slipping is a failure" * contact
-    missed_by = f"{quantity} is off by {missed[i]:.2g} {unit}, and {tolerance:g} is allowed"
-    return f"the next state does not follow: {missed_by}{slips}"

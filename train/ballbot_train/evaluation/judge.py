@@ -1,0 +1,147 @@
+"""Whether a recorded motion breaks a rule, and what it cost: every step must be the engine's, and errors must not add up."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import certified, dynamics
+from ballbot_gym.engines import make_simulator
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import limit_names, outcome
+from ballbot_train.evaluation import recordings, steering
+
+TOLERANCE = 1e-6
+"""Largest difference of a recorded state from the one that follows, m, rad and per second, where the state is all that
+decides. Rounding to the grids makes at most 1.2e-7 of it. As a force it is 1e-4 N."""
+CONTACT_TOLERANCE = 1e-4
+"""The same where an engine simulates the contact of a rolling ball; as a force 0.01 N. Each step then starts with a ball that
+rolls without slipping, which honest motions in grip keep within 1e-5. A ball that slips has a spin that none holds."""
+SLIP_TOLERANCE = 1e-3
+"""Largest slip of a rolling ball after a step, m/s. Honest motions in grip keep within 5e-5."""
+STEERED = 1e-4
+"""The part of an episode's cost that the errors of all its steps may have changed, see `steering.steered`. Honest motions
+keep within 1e-5."""
+
+SUCCESS, MISSED, NO_PLAN = "success", "missed", "no plan"
+_SLIPS = "Balls that slip cannot be verified; record with physics rk4, where slipping is a failure"
+
+
+class SubmissionError(ValueError):
+    """A submission that is refused; the message says where and why."""
+
+
+class Steps:
+    """All control steps of a recording in turn: episode and number (from 1) of each, the states around it and its action."""
+
+    def __init__(self, recording: recordings.Recording, path: str | Path):
+        self.path, self.lengths = path, recording.lengths
+        rows = recording.lengths + (recording.lengths > 0)
+        self.first = np.cumsum(rows) - rows
+        self.episode = np.repeat(np.arange(len(rows)), recording.lengths)
+        self.step = np.arange(len(self.episode)) - (np.cumsum(self.lengths) - self.lengths)[self.episode] + 1
+        before = self.first[self.episode] + self.step - 1
+        self.states, self.before, self.after = recording.states, recording.states[before], recording.states[before + 1]
+        self.action = recording.actions
+
+    def refuse(self, where: np.ndarray, why: Any) -> None:
+        """Refuses the recording if a condition holds of any step; `why` gives the reason of the first."""
+        if where.any():
+            i = int(np.argmax(where))
+            raise SubmissionError(f"{self.path}: episode {self.episode[i]}, step {self.step[i]}: {why(i)}")
+
+
+def judged(
+    steps: Steps, physics: str, task: Task, robot: BallbotParams, known: certified.EvaluationSet
+) -> tuple[list[float], list[str]]:
+    """Cost and end of every episode of a recording that breaks no rule."""
+    _check_starts(steps, known)
+    longest = steps.lengths[steps.episode] > task.steps
+    steps.refuse(longest, lambda i: f"the episode is longer than its {task.steps} control steps")
+    steps.refuse(
+        np.abs(steps.action).max(1) > 1, lambda i: f"the action {steps.action[i].tolist()} is beyond its limit of 1"
+    )
+    force = robot.force_limit * steps.action
+    simulated = robot.rolls and physics != "rk4"
+    tolerance = CONTACT_TOLERANCE if simulated else TOLERANCE
+    reached, slip = stepped(physics, robot, task, steps.before, force)
+    error = steps.after - reached
+    missed = np.abs(error)
+    steps.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated))
+    steps.refuse(~(slip <= SLIP_TOLERANCE), lambda i: f"the ball slips at {slip[i]:.2g} m/s. {_SLIPS}")
+    c = known.constants[steps.episode]
+    limits = dynamics.limits(robot, steps.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
+    grip = (np.minimum.reduce(limits),) if limits else ()
+    did = outcome(task, steps.before, force, steps.after, c, steps.step, grip)
+    over = np.broadcast_to(did.terminated + did.truncated > 0, steps.step.shape)
+    last = steps.step == steps.lengths[steps.episode]
+    steps.refuse(over & ~last, lambda i: "the episode has ended here, and the recording goes on")
+    steps.refuse(last & ~over, lambda i: "the recording stops here, and the episode has not ended")
+    n = len(steps.lengths)
+    cost = np.bincount(steps.episode, np.broadcast_to(did.cost, steps.step.shape), n)
+    cost[steps.lengths == 0] = task.survival_pay
+    _check_errors(steps, task, robot, known, error, cost)
+    ends, names = [NO_PLAN] * n, limit_names(task, robot)
+    for i in np.flatnonzero(last):
+        violated = int(did.violated[i])
+        ends[steps.episode[i]] = names[violated] if violated >= 0 else SUCCESS if did.success[i] > 0 else MISSED
+    return cost.tolist(), ends
+
+
+def _check_starts(steps: Steps, known: certified.EvaluationSet) -> None:
+    begun = np.flatnonzero(steps.lengths)
+    starts = np.rint(steps.states[steps.first[begun]] / recordings.GRID)
+    wrong = begun[(starts != np.rint(known.states[begun] / recordings.GRID)).any(1)]
+    if len(wrong):
+        raise SubmissionError(f"{steps.path}: episode {wrong[0]}, step 0: it does not begin at its certified start")
+
+
+def _check_errors(
+    steps: Steps,
+    task: Task,
+    robot: BallbotParams,
+    known: certified.EvaluationSet,
+    error: np.ndarray,
+    cost: np.ndarray,
+) -> None:
+    """Refuses a recording whose small errors, taken together, may have changed the cost of an episode."""
+    ends = np.cumsum(steps.lengths)
+    for i in np.flatnonzero(steps.lengths):
+        n, first, end = steps.lengths[i], steps.first[i], ends[i]
+        moved = steps.states[first : first + n + 1], steps.action[end - n : end]
+        part = steering.steered(task, robot, *moved, known.constants[i], error[end - n : end]) / cost[i]
+        if not part <= STEERED:
+            raise SubmissionError(
+                f"{steps.path}: episode {i}: the small errors of its steps together may have changed its cost by {part:.2%}, "
+                f"and {STEERED:.2%} is allowed; record the motion as the engine gives it"
+            )
+
+
+def stepped(
+    physics: str, robot: BallbotParams, task: Task, before: np.ndarray, force: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The states (n, 8) one control step after others, and how fast a rolling ball then slips (n,), m/s."""
+    dt, slip = task.control_dt, np.zeros(len(before))
+    if physics == "rk4":
+        return dynamics.step(robot, before, force, dt, dynamics.substeps_for(dt)), slip
+    simulator, reached = make_simulator(physics, robot, dt), np.empty_like(before)
+    try:
+        for i, (x, u) in enumerate(zip(before.tolist(), force.tolist(), strict=True)):
+            simulator.reset(tuple(x))
+            reached[i] = simulator.step(tuple(u))
+            if robot.rolls:
+                slip[i] = math.hypot(*simulator.slip())
+    finally:
+        simulator.close()
+    return reached, slip
+
+
+def _jump(missed: np.ndarray, tolerance: float, contact: bool) -> str:
+    """What is wrong with a step whose end is missed by so much."""
+    i = int(np.argmax(np.where(np.isfinite(missed), missed, np.inf)))
+    quantity, unit = dynamics.STATE[i]
+    slips = f". {_SLIPS}" * contact
+    missed_by = f"{quantity} is off by {missed[i]:.2g} {unit}, and {tolerance:g} is allowed"
+    return f"the next state does not follow: {missed_by}{slips}"

@@ -1,0 +1,102 @@
+"""Which rows of the leaderboard are backed by a submission: one that lies beside the row, or one in a release.
+
+`released.txt` beside the rows has a line for each row whose submission moved to a release: the digest of what the row says,
+and the name of its file. So a row that was edited, added or removed by hand is found.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from ballbot_gym import certified, files
+from ballbot_gym.identity import digest
+from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries, summary, too_good, verify
+
+LIST = "released.txt"
+_VERIFIED = (
+    "name",
+    "link",
+    "task",
+    "robot",
+    "physics",
+    "policy",
+    "submission",
+    "versions",
+    "costs",
+    "ends",
+    "steered",
+    "optima",
+)
+
+
+def digest_of(entry: Entry) -> str:
+    """Digest of what was verified of a row, of its submission and of what it says about itself."""
+    row = asdict(entry)
+    return digest([row[name] for name in _VERIFIED])
+
+
+def read_released(folder: Path = LEADERBOARD) -> dict[str, str]:
+    """The digests of the rows whose submissions are in releases, by the names of the rows' files."""
+    path, listed = folder / LIST, {}
+    for line in files.read(path).decode().splitlines() if path.exists() else ():
+        of, _, file = line.partition("  ")
+        if not file or file in listed:
+            raise files.FileError(
+                f"{path}: each line must be a digest, two spaces and the name of one row's file, not {line!r}"
+            )
+        listed[file] = of
+    return listed
+
+
+def unbacked(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> list[str]:
+    """What is wrong with a leaderboard's rows, one sentence each; empty where every row is backed.
+
+    A submission that lies beside its row is verified anew, which takes seconds.
+    """
+    entries, released = read_entries(folder), read_released(folder)
+    found = {path.name for path in folder.glob("*.json")}
+    wrong = [f"{name}: the row is missing, and {LIST} has it" for name in released.keys() - found]
+    wrong += [
+        f"{path.name}: no row lies beside this submission; ballbot verify {path.name} --write {folder.name}"
+        for path in folder.glob("*.npz")
+        if path.with_suffix(".json").name not in found
+    ]
+    for entry in entries:
+        if why := _unbacked(entry, folder, released, episodes):
+            wrong.append(f"{entry.file}: {why}")
+    misnamed = found - {entry.file for entry in entries}
+    return wrong + [f"{name}: the name of the file is not that of its row" for name in sorted(misnamed)]
+
+
+def release(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> Path:
+    """Lists every row that is backed, before the submissions beside them move to a release.
+
+    Raises:
+        ValueError: a row is edited or added by hand.
+    """
+    wrong = unbacked(folder, episodes)
+    present = {path.name for path in folder.glob("*.json")}
+    if wrong := [line for line in wrong if line.split(":", maxsplit=1)[0] in present]:
+        raise ValueError("\n".join(wrong))
+    listed = {entry.file: digest_of(entry) for entry in read_entries(folder)}
+    return files.write(folder / LIST, "".join(f"{of}  {file}\n" for file, of in sorted(listed.items())))
+
+
+def _unbacked(entry: Entry, folder: Path, released: dict[str, str], episodes: int) -> str:
+    """Why a row is not accepted; "" if it is."""
+    if len(entry.costs) != episodes:
+        return f"it has {len(entry.costs)} episodes, and not {episodes}"
+    if any(getattr(entry, name) != value for name, value in summary(entry).items()):
+        return "its success, falls or regret are not those of its episodes"
+    if why := too_good(entry):
+        return why
+    submission = (folder / entry.file).with_suffix(".npz")
+    if submission.exists():
+        try:
+            verified = verify(submission, episodes)
+        except ValueError as error:
+            return str(error)
+        again = f"ballbot verify {submission.name} --write {folder.name}"
+        return "" if verified == entry else f"the submission beside it gives another row; {again}"
+    if entry.file not in released:
+        return f"no submission lies beside it, and {LIST} does not have it"
+    return "" if released[entry.file] == digest_of(entry) else f"it is not the row that {LIST} has"
