@@ -91,9 +91,9 @@ def write_in(
     return files.write(path, to_bytes(Recording(about, *joined)))
 
 
-def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
+def file_of(task: str, robot: str, name: str, ending: str = ".npz", physics: str = "") -> str:
     """Name of the file of what a controller did in a task; no two controllers share one."""
-    return f"{file_name(task, robot)}-{file_part(name)}{ending}"
+    return f"{file_name(task, robot)}-{file_part(name)}{physics and f'-{physics}'}{ending}"
 
 
 def to_bytes(recording: Recording) -> bytes:

@@ -101,8 +101,8 @@ class Entry:
     @property
     def file(self) -> str:
         """Name of its file."""
-        physics = "" if self.physics == next(iter(PHYSICS)) else f"-{self.physics}"
-        return recordings.file_of(self.task, self.robot, self.name + physics, ".json")
+        physics = "" if self.physics == next(iter(PHYSICS)) else self.physics
+        return recordings.file_of(self.task, self.robot, self.name, ".json", physics)
 
     def write(self, folder: Path) -> Path:
         """Writes it as JSON."""
