@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import certified, files
+from ballbot_gym.certified import version
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -101,8 +102,13 @@ def open_run(
     """
     check_least(0, seed=settings.get("seed", 0))
     settings |= robot_setting(robot) | {"policies": policies}
-    facts = provenance() | settings | {"workers": Workers.of(workers).here or "a Ray cluster"}
-    jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    facts = (
+        {"benchmark": version.BENCHMARK}
+        | provenance()
+        | settings
+        | {"workers": Workers.of(workers).here or "a Ray cluster"}
+    )
+    jobs.claim(out, {key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
     return facts
 
 
