@@ -25,6 +25,7 @@ from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import as_controller, run_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns
 from ballbot_train.executors import Workers
+from ballbot_train.policy_files import shipped_ways
 from ballbot_train.provenance import provenance
 
 CHUNK = 5
@@ -108,6 +109,8 @@ def open_run(
         | settings
         | {"workers": Workers.of(workers).here or "a Ray cluster"}
     )
+    ways = {name: shipped_ways()[found] for name, found in policies.items() if found in shipped_ways()}
+    facts |= {"trained_by": ways} if ways else {}
     jobs.claim(out, {key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
     return facts
 
