@@ -16,6 +16,7 @@ from ballbot_train.commands.verify import regret
 from ballbot_train.console import markdown
 from ballbot_train.evaluation import comparison, released
 from ballbot_train.evaluation.submissions import Entry, copies, read_entries
+from ballbot_train.policy_files import shipped_ways
 
 PAGE = Path(__file__).parent / "leaderboard.md"
 FILMS = Path(__file__).parent / "pictures" / "films"
@@ -35,6 +36,11 @@ def page() -> str:
     return _TABLES.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", PAGE.read_text(encoding="utf-8"))
 
 
+def shown_name(entry: Entry) -> str:
+    """The whole way of a shipped policy, and the name of any other row."""
+    return shipped_ways().get(entry.policy, entry.name)
+
+
 def _title(task: str, robot: str, physics: str) -> str:
     return task.capitalize() + (f", {robot}" if robot != PAPER else "") + f", in {PHYSICS_NAMES[physics]}"
 
@@ -43,7 +49,7 @@ def _table(entries: Sequence[Entry]) -> str:
     """Rows with fewer failures first, then those with less regret."""
     ranked = sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
     lines = [
-        [entry.name, regret(entry), f"{round(len(entry.costs) * (1 - entry.success))}", str(group)]
+        [shown_name(entry), regret(entry), f"{round(len(entry.costs) * (1 - entry.success))}", str(group)]
         for entry, group in zip(ranked, _groups(ranked), strict=True)
     ]
     # links in what was handed in are escaped; ours come after that
@@ -51,7 +57,7 @@ def _table(entries: Sequence[Entry]) -> str:
     table = [f"{head} {' | '.join(_HEADER[-2:])} |", f"{rule} --- | --- |"]
     for entry, row in zip(ranked, rows, strict=True):
         if entry.link:
-            row = row.replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |", 1)
+            row = row.replace(f"| {shown_name(entry)} |", f"| [{shown_name(entry)}]({entry.link}) |", 1)
         table.append(f"{row} {' | '.join(_filmed(entry, episode) for episode in extremes(entry))} |")
     notes = [note for entry in ranked if (note := _whose_motion(entry, entries))]
     return "\n".join([*table, *(f"\n{note}" for note in notes)]) + "\n"

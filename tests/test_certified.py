@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 
 from ballbot_gym import certified, dynamics
+from ballbot_gym.certified import version
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_leaderboard
+from ballbot_train.evaluation.submissions import read_entries
 
 SHIPPED = [(robot, name) for robot in ROBOTS for name in TASKS if not (robot.startswith("omni") and name == "weave")]
 """Robots and tasks whose sets come with the package."""
@@ -199,3 +202,23 @@ def test_no_optimum_is_known_where_the_actuator_lags_or_nobody_named_the_randomi
         certified.load("stabilize", PAPER, randomization=Randomization(actuator_lag=(0.0, 0.02)))
     with pytest.raises(certified.CertificateError, match="none of TRACKS"):
         certified.load("stabilize", PAPER, randomization=Randomization(body_mass=(0.9, 1.0)))
+
+
+def test_the_version_of_the_benchmark_is_raised_when_episodes_costs_observations_or_optima_change():
+    """If this fails, raise BENCHMARK, put the new digest here, certify the sets, and measure and verify the rows again."""
+    assert (version.BENCHMARK, version.digest()) == ("1", "244a4bcda693cf4497ed2111")
+
+
+def test_what_is_of_another_version_of_the_benchmark_is_refused(tmp_path, monkeypatch):
+    known, task = certified.load("stabilize", PAPER), make_task("stabilize", PAPER)
+    path = known.save(task, tmp_path / "set.npz", PAPER)
+    assert certified.load("stabilize", PAPER, path).costs[0] == known.costs[0]
+    result = Result("stabilize", "lqr", 0, "rk4", 1.0, 1.0, True, False)
+    write_leaderboard(leaderboard([result]), [result], {}, tmp_path)
+    assert read_results(tmp_path)[0]["benchmark"] == "1"
+    assert {entry.benchmark for entry in read_entries()} == {"1"}
+    monkeypatch.setattr(version, "BENCHMARK", "2")
+    certified.load.__globals__["_read"].cache_clear()
+    for read in (lambda: certified.load("stabilize", PAPER, path), lambda: read_results(tmp_path), read_entries):
+        with pytest.raises(ValueError, match="is of version '1' of the benchmark, and this is version 2"):
+            read()

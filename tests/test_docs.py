@@ -14,12 +14,13 @@ from builders import measured
 
 from ballbot_gym import BallbotEnv, files, named_robot
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands import COMMANDS
 from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.submissions import read_entries
 from ballbot_train.executors import Workers
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import model_free
-from ballbot_train.policy_files import SHIPPED
+from ballbot_train.policy_files import SHIPPED, shipped_ways, way_of
 from ballbot_train.report import figures
 
 ROOT = Path(__file__).parent.parent
@@ -30,6 +31,8 @@ SHORTER = {  # a training that a page calls `# minutes` runs with these too
     "ppo": "--iterations 1 --num-envs 64 --num-steps 48",
     "shac": "--iterations 1 --num-envs 8 --horizon 4",
 }
+OTHERS = {"--help", "--version", "--env-id"}
+"""Options on pages that are not listed by the help of a command: of all commands, and of another program."""
 MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
 MEASURED_AS = measured(1.5, 30.0, 30.0)
 """What its evaluations say, in place of running hundreds of episodes for each."""
@@ -201,13 +204,50 @@ def test_the_readme_s_results_are_rows_of_the_leaderboard():
     }
     expected = {}
     for entry in read_entries():
-        if (entry.task, entry.name) in short and entry.robot == "paper" and entry.physics == "bullet":
+        name = shipped_ways().get(entry.policy, entry.name)
+        if (entry.task, name) in short and entry.robot == "paper" and entry.physics == "bullet":
             parts = [] if entry.regret_mean is None else [f"{100 * entry.regret_mean:.2f} %"]
             parts += [f"{entry.falls} fail"] if entry.falls else []
             misses = entry.ends.count("missed")
-            expected[entry.task, entry.name] = ", ".join(parts + ([f"{misses} miss"] if misses else []))
+            expected[entry.task, name] = ", ".join(parts + ([f"{misses} miss"] if misses else []))
     assert len(expected) > 10
     assert short == expected
+
+
+def test_rows_and_policies_say_by_which_learners_they_came():
+    assert way_of(SHIPPED / "stabilize-ppo.json") == "dagger → shac → ppo"  # demonstrations of shac count
+    assert way_of(SHIPPED / "turn-shac.json") == "dagger → shac → ppo → shac"
+    assert way_of(SHIPPED / "weave-dagger.json") == "dagger"
+    assert way_of(SHIPPED / "stabilize-omni_strong-shac.json") == "shac"
+    entries = [entry for entry in read_entries() if entry.name in ("dagger", "shac", "sac", "ppo")]
+    assert entries
+    assert all(shipped_ways()[entry.policy].endswith(entry.name) for entry in entries)
+
+
+def options_of(typed, *command):
+    """The options that the help of a command names."""
+    return set(re.findall(r"--[a-z][a-z-]*", typed(*command, "--help")[1]))
+
+
+def test_options_that_pages_name_are_options_of_the_commands(typed):
+    learners = {name: options_of(typed, "train", name, "--task", "weave") for name in SHORTER}
+    options = {name: options_of(typed, name) for name in COMMANDS if name != "train"} | learners
+    everywhere = set.union(*options.values())
+    pages = [page for page in PAGES if page.name != "changelog.md" and "experiments" not in page.parts]
+    for page in pages:
+        text = page.read_text()
+        named = set(re.findall(r"`(--[a-z][a-z-]*)", text))
+        assert named - everywhere <= OTHERS, page
+        for line in re.findall(r"`ballbot ([^`]+)`", text):  # an option in a command's line is one of this command
+            name, learner, *_ = [*line.split(), "", ""]
+            of = (
+                learners.get(learner, set.union(*learners.values()))
+                if name == "train"
+                else options.get(name, everywhere)
+            )
+            assert set(re.findall(r"--[a-z][a-z-]*", line)) <= of | {"--help", "--version"}, f"{page}: {line}"
+    _, _, table = (ROOT / "docs" / "settings.md").read_text().partition("## What all runs take")
+    assert set(re.findall(r"`(--[a-z][a-z-]*)", table)) <= set.union(*learners.values())
 
 
 def test_every_page_of_experiments_answers_its_question_at_once_and_all_its_data_are_linked():

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_gym import dynamics, files
-from ballbot_gym.certified import cache
+from ballbot_gym.certified import cache, version
 from ballbot_gym.checks import shown
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
@@ -87,6 +87,7 @@ class EvaluationSet:
         names = _PER_EPISODE if varied else _PER_EPISODE[:-2]
         trajectories = self.trajectories[:_FEW] if varied or params.wheels is not None else self.trajectories
         arrays = {
+            "benchmark": np.array(version.BENCHMARK),
             "task": np.array(task.problem()),
             **({} if params == named_robot(PAPER) else {"robot": np.array(repr(params))}),
             **({"randomization": np.array(repr(randomization))} if varied else {}),
@@ -226,6 +227,8 @@ def _arrays_of(path: Path, task: Task, params: BallbotParams, randomization: Ran
         missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
         if missing:
             raise ValueError(f"it has no array {', '.join(missing)}")
+        # sets that were written before there was a version are of the first
+        version.check(str(arrays.get("benchmark", "1")), "it", "compute it again with ballbot certify")
         made_for = [str(arrays["task"]), str(arrays.get("robot", repr(named_robot(PAPER))))]
         made_for.append(str(arrays.get("randomization", repr(Randomization()))))
         for made, wanted in zip(made_for, (task.problem(), repr(params), repr(randomization)), strict=True):

@@ -4,8 +4,10 @@ A policy is two files: weights in `NAME.safetensors` and their description in `N
 """
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -198,6 +200,24 @@ def read_description(path: str | Path) -> dict[str, Any]:
     except (ValueError, TypeError) as error:
         raise PolicyError(f"{description} is not a policy: {error}") from error
     return read
+
+
+def way_of(path: str | Path) -> str:
+    """The whole way of a policy as its record tells it: all learners and demonstrators in turn, as "dagger → shac".
+
+    "" where the record holds no command of `ballbot train`.
+    """
+    training = read_description(path).get("training", {})
+    # "command" makes the policy anew by today's options; "made_by" is what made it, where that differs
+    command = str(training.get("made_by") or training.get("command"))
+    names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
+    return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])
+
+
+@lru_cache(maxsize=1)
+def shipped_ways() -> Mapping[str, str]:
+    """The whole way of each shipped policy, by the SHA-256 of its weights."""
+    return {weights_digest(path): way_of(path) for path in SHIPPED.glob("*.json")}
 
 
 def shipped_policies(task: Task, robot: str = PAPER, track: str | None = "") -> dict[str, Path]:

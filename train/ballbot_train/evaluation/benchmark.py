@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import certified, files
+from ballbot_gym.certified import version
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.identity import problem_digest
 from ballbot_gym.params import BallbotParams
@@ -25,6 +26,7 @@ from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import as_controller, run_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns, with_short_names
 from ballbot_train.executors import Workers
+from ballbot_train.policy_files import shipped_ways
 from ballbot_train.provenance import provenance
 
 _TABLES = ("leaderboard", "tracks", "robustness", "transfer", "basins")
@@ -125,8 +127,15 @@ def open_run(
             about = files.read_json(path).get("about")
             held = {key: value for key, value in about.items() if key in settings} if isinstance(about, dict) else {}
             jobs.check_same(held, settings, out, "results")
-    facts = provenance() | settings | {"workers": Workers.of(workers).here or "a Ray cluster"}
-    jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    facts = (
+        {"benchmark": version.BENCHMARK}
+        | provenance()
+        | settings
+        | {"workers": Workers.of(workers).here or "a Ray cluster"}
+    )
+    ways = {name: shipped_ways()[found] for name, found in policies.items() if found in shipped_ways()}
+    facts |= {"trained_by": ways} if ways else {}
+    jobs.claim(out, {key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
     return facts
 
 

@@ -13,6 +13,7 @@ from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entrie
 
 LIST = "released.txt"
 _VERIFIED = (
+    "benchmark",
     "name",
     "link",
     "task",

@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ballbot_gym import files
+from ballbot_gym.certified import version
 from ballbot_gym.display import Displayed, percent
 from ballbot_train.evaluation.statistics import interval
 from ballbot_train.names import shortened
@@ -136,14 +137,17 @@ def write_results(
     renamed: Mapping[str, str] = {},
     **more: Any,
 ) -> None:
-    """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", the rows, and more.
+    """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", with the version of the
+    benchmark, the rows, and more.
 
     Some columns of the CSV files may have other names than the fields.
     """
     for table, entries in ((name, rows), ("episodes", results)):
         named = [{renamed.get(key, key): value for key, value in columns(entry).items()} for entry in entries]
         files.write_csv(out / f"{table}.csv", named)
-    files.write(out / f"{name}.json", to_json({"about": facts, **more, "rows": rows}))
+    files.write(
+        out / f"{name}.json", to_json({"about": {"benchmark": version.BENCHMARK, **facts}, **more, "rows": rows})
+    )
 
 
 def write_leaderboard(rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path) -> None:
@@ -158,17 +162,19 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
         path: its folder or its leaderboard.json.
 
     Raises:
-        ValueError: it is none of these, or damaged.
+        ValueError: it is none of these, damaged, or of another version of the benchmark.
     """
     path = Path(path)
     path = path / "leaderboard.json" if path.is_dir() else path
     try:
         document = files.read_json(path)
-        return dict(document["about"]), [_from_json(entry) for entry in document["episodes"]]
+        about, results = dict(document["about"]), [_from_json(entry) for entry in document["episodes"]]
     except files.FileError as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
+    version.check(about.get("benchmark"), path, "measure again")
+    return about, results
 
 
 def _from_json(entry: Mapping[str, Any]) -> Result:

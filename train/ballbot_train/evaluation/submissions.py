@@ -19,6 +19,7 @@ import numpy as np
 
 import ballbot_train
 from ballbot_gym import certified, files
+from ballbot_gym.certified import version
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
@@ -69,6 +70,7 @@ class Entry:
     """Of each certified episode, in order, the price of a failure included."""
     ends: list[str]
     """How each ended: "success", "missed" (the goal, in time), "no plan", or the limit that was violated."""
+    benchmark: str = version.BENCHMARK
     success: float = 0.0
     falls: int = 0
     regret_mean: float | None = None
@@ -114,11 +116,13 @@ def read_entries(folder: Path = LEADERBOARD) -> list[Entry]:
 
     Raises:
         FileError: a file that holds no row.
+        ValueError: a row of another version of the benchmark.
     """
     entries = []
     for path in sorted(folder.glob("*.json")):
         try:
-            entry = Entry(**files.read_json(path))
+            entry = Entry(**{"benchmark": "1"} | files.read_json(path))
+            version.check(entry.benchmark, path, "record and verify it again")
         except TypeError as error:
             raise files.FileError(f"{path} holds no row of a leaderboard: {error}") from error
         if wrong := _wrong_row(entry):

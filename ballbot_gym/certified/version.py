@@ -1,0 +1,30 @@
+"""The version of the benchmark: which episodes, costs, observations and optima a regret is of.
+
+Ids such as `BallbotTurn-v0` name an environment, and stay. Certified sets, results and the leaderboard's rows hold the
+version, and what is of another one is refused.
+"""
+
+BENCHMARK = "1"
+"""Raised whenever `digest` changes."""
+
+
+def check(found: object, what: object, remedy: str) -> None:
+    """Raises a ValueError where something is of another version of the benchmark."""
+    if found != BENCHMARK:
+        raise ValueError(
+            f"{what} is of version {found!r:.40} of the benchmark, and this is version {BENCHMARK}; {remedy}"
+        )
+
+
+def digest() -> str:
+    """Digest of the four shipped tasks with the paper's robot: episodes, costs, limits, observations and optima."""
+    from ballbot_gym import certified, identity
+    from ballbot_gym.env import make_task
+    from ballbot_gym.robots import PAPER, named_robot
+
+    robot, parts = named_robot(PAPER), []
+    for name in ("stabilize", "turn", "orbit", "weave"):
+        task, known = make_task(name, PAPER), certified.load(name, PAPER)
+        numbers = [*known.states.ravel(), *known.constants.ravel(), *known.costs]
+        parts.append([identity.problem_digest(task, robot), [f"{value:.9g}" for value in numbers]])
+    return identity.digest(parts)
