@@ -1,4 +1,5 @@
 import csv
+import io
 import json
 import math
 import pickle
@@ -10,13 +11,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from builders import FunctionController, result
+from rich.console import Console
 
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
+from ballbot_train import console
 from ballbot_train.evaluation import benchmark, evaluate
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, portable
@@ -192,3 +196,31 @@ def test_whatever_is_evaluated_can_be_compared(tmp_path):
     (compared,) = compare(read_results(tmp_path / "0.0"), read_results(tmp_path / "0.5"))
     assert compared.controller == "gain 0.0 → gain 0.5"
     assert compared.episodes == 8
+
+
+def test_an_evaluation_runs_torch_on_one_thread_and_gives_the_others_back():
+    seen = []
+
+    def fails(observation):
+        seen.append(torch.get_num_threads())
+        raise RuntimeError("as a policy may")
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(RuntimeError, match="as a policy may"):
+            evaluate.evaluate(fails, "stabilize", 1, "rk4")
+        assert (seen, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("terminal", "after", "is_shown"), [(True, 0.0, True), (True, 60.0, False), (False, 0.0, False)]
+)
+def test_an_evaluation_that_takes_long_shows_a_bar_on_a_terminal(terminal, after, is_shown, monkeypatch):
+    printed = Console(file=io.StringIO(), width=100, force_terminal=terminal, force_interactive=terminal)
+    monkeypatch.setattr(console, "console", printed)
+    monkeypatch.setattr(console, "LATE_SECONDS", after)
+    evaluate.evaluate(lambda observation: np.zeros(2), "stabilize", 3, "rk4")
+    assert ("3/3" in printed.file.getvalue()) == is_shown
