@@ -153,7 +153,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         Args:
             task: a name in `TASKS`, or a Task.
             physics: "bullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the closed-form model.
-                Default, the first of these that is installed; "rk4" comes with a warning.
+                Default, the first of these that is installed, for every id too; "rk4" comes with a warning.
             render_mode: None; "rgb_array", which needs no display; or "human": a page in the browser, in real time.
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and

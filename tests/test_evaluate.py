@@ -24,7 +24,7 @@ from ballbot_train import console
 from ballbot_train.evaluation import benchmark, evaluate
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, portable
-from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.policy import PolicyNetwork, save_policy
 from ballbot_train.policy_files import PolicySpec, shipped_policies
 
@@ -224,3 +224,34 @@ def test_an_evaluation_that_takes_long_shows_a_bar_on_a_terminal(terminal, after
     monkeypatch.setattr(console, "LATE_SECONDS", after)
     evaluate.evaluate(lambda observation: np.zeros(2), "stabilize", 3, "rk4")
     assert ("3/3" in printed.file.getvalue()) == is_shown
+
+
+def test_rows_and_files_say_their_engine(tmp_path):
+    results = [result(), result(physics="mujoco")]
+    rows = leaderboard(results)
+    assert [(row.physics, row.episodes, row.facts()["physics"]) for row in rows] == [
+        ("rk4", 1, "rk4"),
+        ("mujoco", 1, "mujoco"),
+    ]
+    assert [dict(zip(HEADER, cells(row), strict=True))["physics"] for row in rows] == ["rk4", "mujoco"]
+    write_leaderboard(rows, results, {}, tmp_path)
+    for name in ("leaderboard.csv", "episodes.csv"):
+        with (tmp_path / name).open() as file:
+            assert [entry["physics"] for entry in csv.DictReader(file)] == ["rk4", "mujoco"]
+
+
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        ("benchmark --controllers lqr", "leaderboard.md"),
+        ("benchmark --controllers lqr --randomization late", "tracks.md"),
+        ("robustness --controllers lqr --stresses delay", "robustness.md"),
+    ],
+)
+def test_tables_of_commands_say_their_engine(command, file, tmp_path, typed):
+    words = ["--tasks", "turn", "--episodes", "1", "--workers", "1", "--physics", "rk4", "--out", "out"]
+    ended, printed = typed(*command.split(), *words)
+    assert ended == 0, printed
+    header, _, first = (tmp_path / "out" / file).read_text().splitlines()[:3]
+    told = dict(zip(header.split(" | "), first.split(" | "), strict=True))
+    assert told["physics"] == "rk4"
