@@ -9,7 +9,8 @@ import tomllib
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parent.parent
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = PYPROJECT["project"]
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 MACHINES = {
     "Linux x86-64": ("linux", "x86_64"),
@@ -57,3 +58,23 @@ def test_the_pythons_and_systems_are_the_same_in_classifiers_readme_tutorial_and
     systems = {text.rpartition(" ")[2] for text in PROJECT["classifiers"] if "Operating System" in text}
     assert systems == {"Linux", "Windows", "MacOS"}
     assert "PyBullet is installed on Linux x86-64 with\nPython 3.10 or 3.11, and MuJoCo in its place" in needs[0]
+
+
+def test_on_a_package_index_every_link_and_picture_of_readme_is_absolute_and_of_a_file_that_exists():
+    hook = PYPROJECT["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
+    (fragment,) = hook["fragments"]
+    text = (ROOT / fragment["path"]).read_text()
+    for each in hook["substitutions"]:
+        text = re.sub(each["pattern"], each["replacement"], text)
+    repository = PROJECT["urls"]["Homepage"]
+    raw = repository.replace("//github.com", "//raw.githubusercontent.com")
+    links = re.findall(r"(!?)\[[^\]]*\]\(([^)]*)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    assert {link for picture, link in links if picture} == {
+        f"{raw}/main/docs/pictures/{name}" for name in ("logo.svg", "lean.webp")
+    }
+    for picture, link in links:
+        assert link.startswith("https://")
+        start = f"{raw}/main/" if picture else f"{repository}/blob/main/"
+        if link.startswith((repository, raw)):
+            assert link.startswith(start)
+            assert (ROOT / link.removeprefix(start).partition("#")[0]).is_file(), link
