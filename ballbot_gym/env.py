@@ -21,7 +21,7 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
-from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
+from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import picture
@@ -151,9 +151,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         """Makes the environment; usually through `gymnasium.make("BallbotStabilize-v0", ...)`.
 
         Args:
-            task: a name in `TASKS`, or a Task.
-            physics: "bullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the closed-form model.
-                Default, the first of these that is installed; "rk4" comes with a warning.
+            task: a name in `TASKS`, an id, or a Task.
+            physics: "bullet" or "pybullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the
+                closed-form model. Default, for every id too, the first that is installed; "rk4" comes with a warning.
             render_mode: None; "rgb_array", which needs no display; or "human": a page in the browser, in real time.
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
@@ -176,9 +176,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._page: Viewer | None = None
         self._state: State = ()  # until the first reset
         self.params = checked_robot(robot, params)
-        physics = default_physics() if physics is None else physics
-        if not isinstance(physics, str) or physics not in PHYSICS:
-            raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
+        physics = checked_physics(physics)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         if render_mode == "human":
@@ -538,7 +536,7 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
     """The task named, with some fields replaced.
 
     Args:
-        task: a name in `TASKS`, MODULE:NAME of one that a module registers, or a Task.
+        task: a name in `TASKS`, MODULE:NAME of one that a module registers, its id, or a Task.
         robot: whose defaults the fields have: a name in `ROBOTS`, or a BallbotParams.
         **task_fields: fields that replace the defaults.
 

@@ -75,13 +75,14 @@ def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
 
 
 def named_task(name: Any) -> str:
-    """The name in `TASKS` of a task that is given by it, or by MODULE:NAME.
+    """The name in `TASKS` of a task that is given by it, by its id, or by MODULE:NAME.
 
     Raises:
         ValueError: no task of that name.
     """
     known = {f"{kind.__module__}:{short}": short for short, kind in TASKS.items()}
     short = (known.get(name) or short_name(name)) if isinstance(name, str) else None
+    short = next((known for known, kind in TASKS.items() if kind.id == short), short)
     if short not in TASKS:
         raise ValueError(
             f"unknown task {name!r}; known: {', '.join(map(repr, TASKS))}, or MODULE:NAME where your module calls "

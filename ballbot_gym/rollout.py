@@ -11,7 +11,7 @@ import numpy as np
 
 from ballbot_gym.checks import real_array
 from ballbot_gym.display import Moving
-from ballbot_gym.engines import default_physics, make_simulator
+from ballbot_gym.engines import checked_physics, make_simulator
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -194,7 +194,7 @@ def simulate(
 
     `physics` is "bullet", "mujoco" or "rk4"; default, the first that is installed, as for environments.
     """
-    simulator = make_simulator(default_physics() if physics is None else physics, params, control_dt)
+    simulator = make_simulator(checked_physics(physics), params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))
     controller.reset(0.0, x, np.zeros(0))

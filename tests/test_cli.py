@@ -14,6 +14,7 @@ from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import load
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train import cli
 from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 from ballbot_train.commands.certify import certify
 
@@ -203,3 +204,37 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
     assert len(made.trajectories) == 3
     assert certified.path_of(make_task("turn")).read_bytes() == packaged
+
+
+@pytest.mark.parametrize(
+    ("typed_as", "means"),
+    [
+        (("--task", "BallbotTurn-v0"), ["--task", "turn"]),
+        (("--tasks=BallbotTurn-v0",), ["--tasks=turn"]),
+        (("--tasks", "BallbotStabilize-v0", "weave"), ["--tasks", "stabilize", "weave"]),
+        (("--physics", "pybullet"), ["--physics", "bullet"]),
+        (("--out", "BallbotTurn-v0"), ["--out", "BallbotTurn-v0"]),
+        (("--out=pybullet", "BallbotNone-v0"), ["--out=pybullet", "BallbotNone-v0"]),
+    ],
+)
+def test_ids_and_names_of_libraries_are_understood(typed_as, means):
+    assert cli._registered(list(typed_as)) == means
+
+
+def test_a_command_takes_the_id_of_a_task(tmp_path, typed):
+    words = ("--tasks", "BallbotTurn-v0", "--controllers", "lqr", "--episodes", 1, "--workers", 1, "--physics", "rk4")
+    ended, printed = typed("benchmark", *words, "--out", "out")
+    assert ended == 0, printed
+    (row,) = json.loads((tmp_path / "out" / "leaderboard.json").read_text())["rows"]
+    assert row["task"] == "turn"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes break in other words there")
+@pytest.mark.parametrize("arguments", [["--help"], ["benchmark", "--help"], ["train", "ppo", "--help"], ["--version"]])
+def test_a_command_that_nobody_reads_ends_without_a_word(arguments):
+    code = "from ballbot_train.cli import main; main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        run.stdout.close()  # as `head` does when it has enough
+        assert run.stderr.read() == ""

@@ -1,4 +1,5 @@
 import csv
+import io
 import json
 import math
 import pickle
@@ -10,17 +11,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from builders import FunctionController, result
+from rich.console import Console
 
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
+from ballbot_train import console
 from ballbot_train.evaluation import benchmark, evaluate
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, portable
-from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.policy import PolicyNetwork, save_policy
 from ballbot_train.policy_files import PolicySpec, shipped_policies
 
@@ -192,3 +196,62 @@ def test_whatever_is_evaluated_can_be_compared(tmp_path):
     (compared,) = compare(read_results(tmp_path / "0.0"), read_results(tmp_path / "0.5"))
     assert compared.controller == "gain 0.0 → gain 0.5"
     assert compared.episodes == 8
+
+
+def test_an_evaluation_runs_torch_on_one_thread_and_gives_the_others_back():
+    seen = []
+
+    def fails(observation):
+        seen.append(torch.get_num_threads())
+        raise RuntimeError("as a policy may")
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(RuntimeError, match="as a policy may"):
+            evaluate.evaluate(fails, "stabilize", 1, "rk4")
+        assert (seen, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("terminal", "after", "is_shown"), [(True, 0.0, True), (True, 60.0, False), (False, 0.0, False)]
+)
+def test_an_evaluation_that_takes_long_shows_a_bar_on_a_terminal(terminal, after, is_shown, monkeypatch):
+    printed = Console(file=io.StringIO(), width=100, force_terminal=terminal, force_interactive=terminal)
+    monkeypatch.setattr(console, "console", printed)
+    monkeypatch.setattr(console, "LATE_SECONDS", after)
+    evaluate.evaluate(lambda observation: np.zeros(2), "stabilize", 3, "rk4")
+    assert ("3/3" in printed.file.getvalue()) == is_shown
+
+
+def test_rows_and_files_say_their_engine(tmp_path):
+    results = [result(), result(physics="mujoco")]
+    rows = leaderboard(results)
+    assert [(row.physics, row.episodes, row.facts()["physics"]) for row in rows] == [
+        ("rk4", 1, "rk4"),
+        ("mujoco", 1, "mujoco"),
+    ]
+    assert [dict(zip(HEADER, cells(row), strict=True))["physics"] for row in rows] == ["rk4", "mujoco"]
+    write_leaderboard(rows, results, {}, tmp_path)
+    for name in ("leaderboard.csv", "episodes.csv"):
+        with (tmp_path / name).open() as file:
+            assert [entry["physics"] for entry in csv.DictReader(file)] == ["rk4", "mujoco"]
+
+
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        ("benchmark --controllers lqr", "leaderboard.md"),
+        ("benchmark --controllers lqr --randomization late", "tracks.md"),
+        ("robustness --controllers lqr --stresses delay", "robustness.md"),
+    ],
+)
+def test_tables_of_commands_say_their_engine(command, file, tmp_path, typed):
+    words = ["--tasks", "turn", "--episodes", "1", "--workers", "1", "--physics", "rk4", "--out", "out"]
+    ended, printed = typed(*command.split(), *words)
+    assert ended == 0, printed
+    header, _, first = (tmp_path / "out" / file).read_text().splitlines()[:3]
+    told = dict(zip(header.split(" | "), first.split(" | "), strict=True))
+    assert told["physics"] == "rk4"

@@ -322,6 +322,94 @@ def drive(browser):
     )
 
 
+def test_a_drive_is_kept_in_a_link_and_replayed_and_what_is_no_drive_is_none(engine, tmp_path):
+    script = """
+    const driven = (driver) => {
+      const [robot] = robotsOf(DATA.scenarios[1], driver), xs = [];
+      for (let i = 0; i < 300; i++, xs.push(robot.x)) {
+        driver.hold(Math.sin(0.1 * i), i < 100 ? -1 : 0.3);
+        robot.advance();
+      }
+      return xs;
+    };
+    const driver = new Driver(), letters = [driven(driver), packedDrive(driver.drive)];
+    const replayed = driven(new Replayed(unpackedDrive(letters[1])));
+    const none = ["", "%", "AAA=", "A", "////", "_wD_", "AQ", "<b>", "\u20ac"].map(unpackedDrive);
+    answer([letters, replayed, none, unpackedDrive("_4CA".repeat(1000))]);
+    """
+    (xs, letters), replayed, none, too_long = run_in_node(engine + script, tmp_path)
+    assert replayed == xs
+    assert re.fullmatch(r"[\w-]{10,1200}", letters)
+    assert [*none, too_long] == [None] * 10
+
+
+def test_keys_work_after_the_click_that_begins_a_drive_and_time_begins_after_a_countdown(opened):
+    from selenium.webdriver import ActionChains, Keys
+
+    opened.find_element("css selector", ".drive").click()
+    count = "return [playground.time, document.querySelector('.count').textContent]"
+    assert opened.execute_script(count)[0] == 0
+    assert opened.execute_script("playground.draw(0.1); playground.tick(0, 0);" + count) in ([0, "3"], [0, "2"])
+    ActionChains(opened).key_down(Keys.ARROW_RIGHT).perform()
+    assert opened.execute_script("return Math.hypot(...playground.driver.goal)") == pytest.approx(1)
+    ActionChains(opened).key_up(Keys.ARROW_RIGHT).perform()
+    assert opened.execute_script("return playground.driver.goal") == [0, 0]
+    end = time.monotonic() + 60
+    while opened.execute_script(count) in ([0, "3"], [0, "2"], [0, "1"]):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    while not opened.execute_script("return playground.time > 0"):
+        assert time.monotonic() < end
+    assert opened.execute_script(count)[1] == ""
+
+
+BY_KEYS = """
+const [mine] = playground.robots, shown = [], view = document.activeElement;
+const press = (key, isHeld) => view.dispatchEvent(new KeyboardEvent(isHeld ? "keydown" : "keyup", { key }));
+while (!mine.over) {
+  const wanted = [0, 1].map((i) => -0.1 * mine.x[i] - 0.25 * mine.x[4 + i]);
+  for (const [key, along] of Object.entries(ARROWS).slice(0, 4)) {
+    const [a, b] = playground.onFloor(...along);
+    press(key, a * wanted[0] + b * wanted[1] > 0.15);
+  }
+  playground.advance();
+  playground.showNumbers();
+  shown.push(document.querySelector("tbody tr").cells[5].textContent);
+}
+return [shown, mine.x, mine.ended]
+"""
+STATE = "return [playground.robots[0].over, playground.robots[0].x, document.querySelector('.text').textContent]"
+
+
+def test_a_drive_by_keys_ends_with_a_sentence_and_a_link_that_replays_it(opened, page):
+    opened.find_element("css selector", ".drive").click()
+    shown, x, ended = opened.execute_script(BY_KEYS)
+    assert ended in ("", "goal")  # it did not fall
+    assert len(shown) > 100
+    assert all(re.fullmatch(r"at least \d+ %|", text) for text in shown[:-1])
+    assert re.fullmatch(r"regret \d+\.\d %", shown[-1])
+    text = opened.find_element("css selector", ".text").text
+    assert text.startswith("You ")
+    assert shown[-1] in text
+    link = opened.find_element("css selector", ".link").get_attribute("href")
+    assert link.startswith(f"{page.as_uri()}#drive=stabilize.7.100-100-100.")
+    opened.get("about:blank")
+    opened.get(link)
+    opened.execute_script("while (!playground.robots[0].over) playground.advance()")
+    over, replayed, text = opened.execute_script(STATE)
+    assert (over, replayed) == (True, x)
+    assert text.startswith("The driver ")
+
+
+@pytest.mark.parametrize(
+    "address", ["#drive=stabilize.7.100-100-100.%3Cb%3E", "#drive=none.7.1-1-1.AAA", "#drive", "#x"]
+)
+def test_an_address_that_tells_of_no_drive_changes_nothing(address, opened, page):
+    opened.get("about:blank")
+    opened.get(page.as_uri() + address)
+    assert opened.execute_script("return [playground.index, playground.driver]") == [0, None]
+
+
 def test_who_drives_an_episode_gets_a_regret(opened):
     opened.find_element("css selector", ".drive").click()  # from Push, which has no optimum, to Throw
     opened.execute_script("playground.setPlaying(false)")

@@ -291,3 +291,20 @@ def test_a_task_that_no_optimizer_can_use_is_refused_by_the_name_of_its_method(n
     task = type("Wrong", (Stabilize,), {"id": "Wrong-v0", **methods})()
     with pytest.raises(ValueError, match=message):
         optima.known(task, "paper", [0])
+
+
+def test_a_task_is_known_by_its_id_wherever_its_name_is(make_env):
+    for name, kind in TASKS.items():
+        assert make_task(kind.id) == make_task(name)
+    assert make_env("BallbotTurn-v0", physics="rk4").task == make_task("turn")
+    assert evaluate.evaluate(lambda seen: np.zeros(2), "BallbotTurn-v0", 1, "rk4").task == "turn"
+    with pytest.raises(ValueError, match="unknown task 'BallbotNone-v0'"):
+        make_task("BallbotNone-v0")
+
+
+def test_pybullet_is_another_name_of_bullet(make_env):
+    pytest.importorskip("pybullet")
+    env = make_env(physics="pybullet")
+    assert env.physics == "bullet"
+    assert evaluate.evaluate(lambda seen: np.zeros(2), "turn", 1, "pybullet").physics == "bullet"
+    assert gymnasium.make("BallbotTurn-v0", physics="pybullet").unwrapped.physics == "bullet"

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 from ballbot_gym.engines.bullet import BulletContactSimulator, BulletOmniSimulator, BulletSimulator
 from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, import_pybullet
@@ -14,10 +15,12 @@ from ballbot_gym.params import BallbotParams
 
 __all__ = [
     "PHYSICS",
+    "PHYSICS_ALIASES",
     "PHYSICS_NAMES",
     "Simulator",
     "State",
     "check_installed",
+    "checked_physics",
     "default_physics",
     "installed_physics",
     "make_simulator",
@@ -37,6 +40,9 @@ The first that is installed is the default.
 PHYSICS_NAMES = {"bullet": "PyBullet", "mujoco": "MuJoCo", "rk4": "the closed-form model"}
 """What people call each physics."""
 
+PHYSICS_ALIASES = {"pybullet": "bullet"}
+"""Other names that people type."""
+
 _noticed: list[bool] = []
 
 
@@ -44,6 +50,20 @@ def installed_physics() -> list[str]:
     """The physics that this machine can run, in the order of `PHYSICS`."""
     libraries = {"bullet": "pybullet", "mujoco": "mujoco", "rk4": "numpy"}
     return [name for name in PHYSICS if find_spec(libraries[name]) is not None]
+
+
+def checked_physics(physics: Any) -> str:
+    """The name in `PHYSICS` of a physics that is given by it or by another of `PHYSICS_ALIASES`; None is the default.
+
+    Raises:
+        ValueError: no physics of that name.
+    """
+    if physics is None:
+        return default_physics()
+    name = PHYSICS_ALIASES.get(physics, physics) if isinstance(physics, str) else physics
+    if not isinstance(name, str) or name not in PHYSICS:
+        raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
+    return name
 
 
 def check_installed(physics: str) -> None:
@@ -62,7 +82,7 @@ def default_physics() -> str:
         warnings.warn(
             f'Neither PyBullet nor MuJoCo is installed: physics="rk4" is used. For MuJoCo: {install("mujoco")}. '
             f"PyBullet: {HOW_TO_GET_IT}",
-            stacklevel=3,
+            stacklevel=4,
         )
     return best
 

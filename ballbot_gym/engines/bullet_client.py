@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from types import ModuleType
 
-HOW_TO_GET_IT = 'Get it with "pip install pybullet", under Python 3.11 or older: newer ones have no wheel.'
+HOW_TO_GET_IT = (
+    'Get it with "pip install pybullet" on Linux x86-64 under Python 3.10 or 3.11: elsewhere it has no wheel.'
+)
 
 
 def import_pybullet() -> ModuleType:
@@ -17,7 +19,7 @@ def import_pybullet() -> ModuleType:
             import pybullet
     except ImportError as error:
         raise ImportError(
-            f'PyBullet is not installed. {HOW_TO_GET_IT} Or use physics="rk4", which needs only NumPy.'
+            f'PyBullet is not installed. {HOW_TO_GET_IT} Or use physics="mujoco", or "rk4", which needs only NumPy.'
         ) from error
     if not pybullet.isNumpyEnabled():
         raise ImportError(

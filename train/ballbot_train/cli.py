@@ -25,12 +25,25 @@ from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
+_NO_READER = 141  # as of what the signal SIGPIPE ends
+_ID = re.compile(r"([\w-]+/)?\w+-v\d+")  # of an environment
 _MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[a-z][a-z0-9_]*")
 
 
 def main() -> None:
-    """Runs the command line; errors a user can cause end with one line and exit status 1, misused commands with 2."""
-    sys.exit(_run(sys.argv[1:]))
+    """Runs the command line; errors a user can cause end with one line and exit status 1, misused commands with 2.
+
+    Where nobody reads what is printed any more, as behind `| head`, it ends without a word.
+    """
+    try:
+        try:
+            status = _run(sys.argv[1:])
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains when it ends
+        status = _NO_READER
+    sys.exit(status)
 
 
 def _run(arguments: list[str]) -> int:
@@ -65,6 +78,8 @@ def _run(arguments: list[str]) -> int:
         errors.print(f"ballbot: {error}{hint}", style="red")
         return 1
     except (ValueError, TypeError, ImportError, OSError, *_expected()) as error:
+        if isinstance(error, BrokenPipeError):
+            print(flush=True)  # raises it again if it was that of what we print, and not that of a worker
         errors.print(f"ballbot: {error}", style="red")
         return 1
     return 0
@@ -87,8 +102,9 @@ def _call(command: str, options: list[str]) -> Any:
 
 
 def _registered(options: list[str]) -> list[str]:
-    """The options with the names of tasks and robots that they bring: of MODULE:NAME the module is imported, from this folder
-    too, and a path after --robot is registered under its file's name.
+    """The options with the names of tasks, robots and physics that they bring: of MODULE:NAME the module is imported, from
+    this folder too, a path after --robot is registered under its file's name, and other names become ours: the id of a task,
+    and "pybullet".
     """
     from ballbot_gym.robots import register_robot, short_name
 
@@ -103,6 +119,12 @@ def _registered(options: list[str]) -> list[str]:
             path = Path(word)
             word = re.sub(r"\W", "_", path.stem.lower())
             register_robot(word, path)
+        elif _ID.fullmatch(word) and "--out" not in (flag, *named[-1:]):
+            from ballbot_gym.tasks import TASKS
+
+            word = next((name for name, kind in TASKS.items() if kind.id == word), word)
+        elif word == "pybullet" and "--out" not in (flag, *named[-1:]):
+            word = "bullet"
         named.append(f"{flag}{equals}{word}")
     return named
 

@@ -72,6 +72,8 @@ console = PlainConsole(width=None if sys.stdout.isatty() else 160, force_jupyter
 
 LINE_SECONDS = 10.0
 """How often progress is printed into a file or a pipe."""
+LATE_SECONDS = 2.0
+"""After how long `late_bar` shows."""
 
 
 class _SpeedColumn(ProgressColumn):
@@ -142,6 +144,27 @@ def progress_bars(totals: Mapping[str, int]) -> Iterator[Callable[[str, int], No
     with progress_bar() as progress:
         bars = {name: progress.add_task(printable(name), total=total) for name, total in totals.items()}
         yield lambda name, count: progress.advance(bars[name], count)
+
+
+@contextmanager
+def late_bar(name: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Shows one bar, on a terminal alone, when the block has taken `LATE_SECONDS`. Gives what moves it on, and shows it."""
+    if not console.is_terminal:
+        yield lambda count: None
+        return
+    begin, progress = time.monotonic(), progress_bar()
+    bar = progress.add_task(printable(name), total=total)
+
+    def advance(count: int) -> None:
+        if not progress.live.is_started and time.monotonic() - begin >= LATE_SECONDS:
+            progress.start()
+        progress.advance(bar, count)
+
+    try:
+        yield advance
+    finally:
+        if progress.live.is_started:
+            progress.stop()
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -124,7 +124,7 @@ def _print(result: Any, worst: Sequence[dict[str, Any]]) -> None:
     if row.optima:
         shares = (row.regret_mean, row.regret_median, row.regret_p99, row.regret_worst)
         facts.append([f"regret on {row.optima} optima, the same", ", ".join(f"{share:.2%}" for share in shares)])
-    title = f"{result.policy}: {row.episodes} fresh episodes of {result.task.id}, seed {result.seed}"
+    title = f"{result.policy}: {row.episodes} fresh episodes of {result.task.id}, seed {result.seed}, physics=rk4"
     print_table(title, ["", ""], facts)
     weak = [entry for entry in result.bins() if entry["episodes"] >= _FULL_BIN and entry["success"] < 1]
     rows = [

@@ -77,6 +77,7 @@ _TABLE: dict[str, Callable[[list[Row]], str]] = {
     "task": lambda curve: curve[0].task,
     "disturbance": lambda curve: curve[-1].told["stress"],
     "controller": lambda curve: curve[0].controller,
+    "physics": lambda curve: curve[0].physics,
     "severity": lambda curve: " · ".join(f"{row.told['level']:g}" for row in curve),
     "success, %": lambda curve: _joined(100 * row.success for row in curve),
     "falls, %": lambda curve: _joined(100 * row.falls / row.episodes for row in curve),

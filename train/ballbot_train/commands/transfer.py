@@ -33,7 +33,7 @@ _TABLE: dict[str, Callable[[Row], str]] = {
     "controller": lambda row: row.controller,
     "runs on": lambda row: row.told["robot"],
     "friction": lambda row: shown(row.told["friction"], "g"),
-    "physics": lambda row: row.told["physics"],
+    "physics": lambda row: row.physics,
     "success": lambda row: f"{100 * row.success:.1f} %",
     "falls": lambda row: f"{row.falls}/{row.episodes}",
     _REGRET: lambda row: shown(row.regret_mean, ".2%"),
@@ -85,7 +85,7 @@ def transfer(
             robot,
             made_for=own,
             friction=friction,
-            told={"made_for": own, "robot": robot, "friction": floor(robot, friction).friction, "physics": engine},
+            told={"made_for": own, "robot": robot, "friction": floor(robot, friction).friction},
         )
         for own, by_task in chosen.items()
         for task, names in by_task.items()

@@ -5,7 +5,9 @@ Importing this module is light: torch is imported for policy files, CasADi for e
 
 import math
 import numbers
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,6 +21,7 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
+from ballbot_train.console import late_bar
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import make_controller, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
@@ -101,7 +104,8 @@ def evaluate(
 ) -> Row:
     """The leaderboard row of anything that acts.
 
-    Where the package has no optima of the task and the robot, they are computed, and kept in the user's cache.
+    Where the package has no optima of the task and the robot, they are computed, and kept in the user's cache. On a
+    terminal, a bar shows the episodes where they take longer than two seconds.
 
     Args:
         policy: see `as_controller`: a Stable-Baselines3 model, a function of the observation, a Controller, the name of a
@@ -131,7 +135,8 @@ def evaluate(
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), name_of(env.task) or type(env.task).__name__.lower()
         motions: list[recordings.Recording] = []
-        results = run_episodes(env, controller, *named, indices, 0, known, motions)
+        with late_bar("episodes", len(indices)) as advance:
+            results = run_episodes(env, controller, *named, indices, 0, known, motions, advance)
         row = summarize(results)
         if out is not None:
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
@@ -195,8 +200,10 @@ def run_episodes(
     seed: int = 0,
     known: certified.EvaluationSet | None = None,
     motions: list[recordings.Recording] | None = None,
+    advance: Callable[[int], None] = lambda count: None,
 ) -> list[Result]:
-    """Runs certified episodes under any controller; one that finds no plan has failed the episode.
+    """Runs certified episodes under any controller; one that finds no plan has failed the episode. torch computes on one
+    thread meanwhile.
 
     Args:
         env: what to run in.
@@ -207,6 +214,7 @@ def run_episodes(
         seed: of what the env's randomization draws; no two seeds share what an episode draws.
         known: the optima; default, those of the env's task, robot and randomization.
         motions: gets what was done in each episode.
+        advance: is called with 1 after each episode.
 
     Raises:
         PlanError: an episode has no optimum that can be found.
@@ -217,7 +225,8 @@ def run_episodes(
     for i in indices:
         run = None
         try:
-            run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=known.options(i))
+            with _one_thread():
+                run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=known.options(i))
         except PlanError as error:
             measures: dict[str, Any] = {"cost": env.task.survival_pay, "note": str(error)}
             measures |= {"success": False, "failure": True}
@@ -236,4 +245,22 @@ def run_episodes(
         if motions is not None:
             motions.append(recordings.of_episode(None if run is None else run.trajectory, env.params))
         results.append(Result(task, name, i, env.physics, optimum=float(known.costs[i]), **measures))
+        advance(1)
     return results
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """torch, if it is imported, computes on one thread within the block: policies are too small for a second one, and threads
+    that wait for each other at every control step make an episode ten times slower.
+    """
+    torch: Any = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

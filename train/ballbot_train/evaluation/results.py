@@ -52,6 +52,8 @@ class Row(Displayed):
 
     task: str
     controller: str
+    physics: str
+    """"bullet", "mujoco" or "rk4": in which engine."""
     episodes: int
     success: float
     falls: int
@@ -75,6 +77,7 @@ class Row(Displayed):
         return {
             "controller": self.controller,
             "task": self.task,
+            "physics": self.physics,
             "episodes": f"{self.episodes}",
             "success": f"{100 * self.success:.4g} %",
             "failures": f"{self.falls}",
@@ -95,6 +98,7 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
     return Row(
         task=results[0].task,
         controller=results[0].controller,
+        physics=results[0].physics,
         episodes=len(results),
         success=float(np.mean([result.success for result in results])),
         falls=len(results) - len(standing),
@@ -121,10 +125,10 @@ def columns(entry: Any) -> dict[str, Any]:
 
 
 def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
-    """One row for each task, controller and what the results are told by, in their order; seed is of the bootstrap."""
+    """One row for each task, controller, engine and what the results are told by, in order; seed is of the bootstrap."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in results:
-        groups.setdefault((result.task, result.controller, *result.told.items()), []).append(result)
+        groups.setdefault((result.task, result.controller, result.physics, *result.told.items()), []).append(result)
     return [summarize(group, seed) for group in groups.values()]
 
 
@@ -226,6 +230,7 @@ def with_interval(value: float, low: float, high: float, sign: Literal["", "+"] 
 TABLE: dict[str, Callable[[Row], str]] = {
     "task": lambda row: row.task,
     "controller": lambda row: row.controller,
+    "physics": lambda row: row.physics,
     "success": lambda row: f"{100 * row.success:.1f} %",
     "falls": lambda row: f"{row.falls}/{row.episodes}",
     "regret mean": lambda row: with_interval(row.regret_mean, row.regret_low, row.regret_high),

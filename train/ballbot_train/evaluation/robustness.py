@@ -174,6 +174,7 @@ TRACK_TABLE: dict[str, Callable[[Row], str]] = {
     "track": lambda row: row.told["track"],
     "task": lambda row: row.task,
     "controller": lambda row: row.controller,
+    "physics": lambda row: row.physics,
     "success, %": lambda row: f"{100 * row.success:.4g}",
     "failures": lambda row: f"{row.falls} of {row.episodes}",
     "mean regret, %": lambda row: _percent(row.regret_mean),

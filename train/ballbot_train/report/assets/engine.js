@@ -170,6 +170,8 @@ class Optimum extends Robot {
 const STEEPEST = 0.7; // rad, the lean that a stick commands that is fully out
 const STIFFNESS = 60; // 1/s², how a lean is brought to the commanded one
 const DAMPING = 14; // 1/s
+const NOTCHES = 100; // of the stick on the way out: a drive is kept in whole ones, so that a replay is the same
+const LONGEST = 5000; // control steps of a drive that is read
 const SMOOTHING = 0.15; // share of the way to its goal that the stick goes in a control step: keys know no half way
 
 /** A human, whose stick commands the lean. The force that gives it follows from one step of the model, linear in the force. */
@@ -177,6 +179,7 @@ class Driver {
   constructor() {
     this.stick = [0, 0]; // along x and y; at most 1 long
     this.goal = [0, 0]; // where the human holds it
+    this.drive = []; // that in every control step, in notches
   }
 
   /** Holds the stick; more than a length of 1 counts as 1, and what is not finite as 0. */
@@ -186,7 +189,9 @@ class Driver {
   }
 
   act(k, x) {
-    this.stick = this.stick.map((value, i) => value + SMOOTHING * (this.goal[i] - value));
+    if (k === 0) [this.stick, this.drive] = [[0, 0], []];
+    const notches = (this.drive[k] = this.goal.map((value) => Math.round(NOTCHES * value)));
+    this.stick = this.stick.map((value, i) => value + SMOOTHING * (notches[i] / NOTCHES - value));
     const [none, first, second] = [[0, 0], [100, 0], [0, 100]].map((force) => step(x, force, KNOWN).slice(6));
     const [p, q] = this.stick.map((value, i) => {
       const wanted = STIFFNESS * (STEEPEST * value - x[2 + i]) - DAMPING * x[6 + i];
@@ -195,6 +200,50 @@ class Driver {
     const [a, b, c, d] = [first[0] - none[0], second[0] - none[0], first[1] - none[1], second[1] - none[1]];
     return [(d * p - b * q) / (a * d - b * c), (a * q - c * p) / (a * d - b * c)].map((share) => 100 * share);
   }
+}
+
+/** A drive once more: nobody else holds the stick. */
+class Replayed extends Driver {
+  constructor(drive) {
+    super();
+    this.given = drive;
+  }
+
+  hold() {}
+
+  act(k, x) {
+    this.goal = (this.given[k] ?? [0, 0]).map((notches) => notches / NOTCHES);
+    return super.act(k, x);
+  }
+}
+
+/** A drive as letters that an address may have: how often, and which notches, again and again. */
+function packedDrive(drive) {
+  const runs = [];
+  for (const [x, y] of drive) {
+    const last = runs.at(-1);
+    if (last && last[0] < 255 && last[1] === x + 128 && last[2] === y + 128) last[0] += 1;
+    else runs.push([1, x + 128, y + 128]);
+  }
+  return btoa(String.fromCharCode(...runs.flat())).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}
+
+/** The drive of such letters; null where they are none. */
+function unpackedDrive(letters) {
+  if (!/^[\w-]+$/.test(letters)) return null;
+  let text;
+  try {
+    text = atob(letters.replaceAll("-", "+").replaceAll("_", "/"));
+  } catch {
+    return null;
+  }
+  const drive = [];
+  for (let i = 0; i < text.length; i += 3) {
+    const [count, x, y] = [0, 1, 2].map((k) => text.charCodeAt(i + k));
+    if (!(Math.max(Math.abs(x - 128), Math.abs(y - 128)) <= NOTCHES) || drive.length + count > LONGEST) return null;
+    for (let k = 0; k < count; k++) drive.push([x - 128, y - 128]);
+  }
+  return drive;
 }
 
 /** The robots of a scenario: the policy's, then LQR's; where a human drives, the human's, then the policy's. */

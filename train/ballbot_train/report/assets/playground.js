@@ -7,6 +7,7 @@ const STRONGEST = 250; // N·s
 const BY_KEY = 90; // N·s, of a push
 const NEAR = 3.6; // m: the camera's distance from robots that are together
 const GRAB = 60; // px: how far from a robot's parts a drag still pushes it
+const COUNTDOWN = 3; // s, before a drive begins
 const THUMB = 70; // px of a drag that holds the stick fully out
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], a: [-1, 0], d: [1, 0], w: [0, 1], s: [0, -1] };
 
@@ -17,15 +18,34 @@ class Playground extends Player {
     for (const chip of this.find("chips").children) {
       chip.onclick = () => this.open(DATA.scenarios.findIndex(({ title }) => title === chip.textContent));
     }
-    this.find("reset").onclick = () => this.open(this.index, this.driver !== null);
+    this.find("reset").onclick = () => this.open(this.index, this.driver !== null, this.given);
     this.find("episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
-    this.find("drive").onclick = () => this.open(this.index, this.driver === null);
+    this.find("drive").onclick = () => this.open(this.index, this.driver === null || this.given !== null);
     this.sliders = [...this.find("unknown").querySelectorAll("input")];
     for (const slider of this.sliders) slider.oninput = () => this.setRobot();
     this.find("told").onclick = () => this.setRobot(KNOWN);
     this.find("drawn").onclick = () => this.setRobot(this.sliders.map(({ min, max }) => (+min + Math.random() * (max - min)) / 100));
     this.listen();
     this.setRobot(KNOWN, 0);
+    this.openLinked();
+    window.onhashchange = () => this.openLinked();
+  }
+
+  /** Replays the drive of a link; an address that tells of none changes nothing. */
+  openLinked() {
+    const [task, episode, robot = "", letters = ""] = location.hash.replace("#drive=", "").split(".");
+    const index = DATA.scenarios.findIndex((scenario) => scenario.task === task && String(scenario.episode) === episode);
+    const [factors, drive] = [robot.split("-").map((percent) => Number(percent) / 100), unpackedDrive(letters)];
+    if (index < 0 || !drive || factors.length !== KNOWN.length || !factors.every(Number.isFinite)) return;
+    this.setRobot(factors, index);
+    this.open(index, true, drive);
+  }
+
+  /** The address of this page that replays the drive. */
+  get link() {
+    const { task, episode } = this.scenario;
+    const robot = this.sliders.map(({ value }) => value).join("-");
+    return `${location.href.split("#")[0]}#drive=${[task, episode, robot, packedDrive(this.driver.drive)].join(".")}`;
   }
 
   /** The robot's factors, from the sliders unless they are given, and the scenario anew. */
@@ -40,8 +60,8 @@ class Playground extends Player {
     this.open(index, Boolean(this.driver));
   }
 
-  /** Opens a scenario; where the reader drives, in an episode whose optimum is known. */
-  open(index, driven = false) {
+  /** Opens a scenario; where somebody drives, in an episode whose optimum is known. The drive may be given, as of a link. */
+  open(index, driven = false, given = null) {
     if (driven && DATA.scenarios[index].optimum === null) index = DATA.scenarios.findIndex((scenario) => scenario.optimum !== null);
     this.index = index;
     this.scenario = DATA.scenarios[index];
@@ -49,11 +69,15 @@ class Playground extends Player {
     for (const chip of this.find("chips").children) chip.setAttribute("aria-pressed", chip.textContent === title);
     const same = [...DATA.scenarios.entries()].filter(([, scenario]) => scenario.title === title);
     this.find("episode").replaceChildren(...same.map(([i, { episode }]) => new Option(episode ?? "at rest", i, false, i === index)));
-    this.find("text").textContent = driven
+    this.find("text").textContent = given
+      ? "A drive is replayed. Drive it yourself, and do better."
+      : driven
       ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture."
       : `${this.scenario.text} Drag a robot to push it, or the floor to look around.`;
-    this.find("drive").setAttribute("aria-pressed", driven);
-    this.driver = driven ? new Driver() : null;
+    this.find("drive").setAttribute("aria-pressed", driven && !given);
+    this.given = given;
+    this.driver = given ? new Replayed(given) : driven ? new Driver() : null;
+    this.countdown = driven && !given ? COUNTDOWN : 0;
     this.held = new Set(); // keys
     this.robots = robotsOf(this.scenario, this.driver, this.robot);
     // the page has the optima of the robot that everybody knows, and a regret over them would be one over something else
@@ -61,7 +85,8 @@ class Playground extends Player {
     const { label, color } = DATA.policies[task];
     const learned = { label: `${label} policy`, color, alpha: 1 };
     const ghost = DATA.ghost_opacity + 0.15;
-    const looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
+    const driver = { ...DATA.you, alpha: 1, label: given ? "driver" : DATA.you.label };
+    const looks = driven ? [driver, { ...learned, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
     this.everyone = this.best ? [...this.robots, this.best] : this.robots;
     this.everyone.forEach((robot, i) => (robot.look = looks[i] ?? { ...DATA.best, alpha: DATA.ghost_opacity }));
     this.due = this.scenario.push; // the push that comes by itself
@@ -76,6 +101,7 @@ class Playground extends Player {
     const [x, y] = this.scenario.state;
     this.scene.camera.target = [x, y, 0.5];
     this.setPlaying(true);
+    if (driven && !given) this.find("view").focus({ preventScroll: true }); // the keys are for the robot from now on
   }
 
   /** All robots in one state, at time 0. */
@@ -96,7 +122,22 @@ class Playground extends Player {
     }
     for (const robot of this.everyone) robot.advance();
     this.time += DATA.dt;
-    if (this.driver && this.robots[0].over) this.setPlaying(false);
+    if (this.driver && this.playing && this.robots[0].over) this.end();
+  }
+
+  /** Ends a drive with a sentence, and a link that shows it to others. */
+  end() {
+    this.setPlaying(false);
+    const [mine, policy] = this.robots;
+    const seconds = (mine.steps * DATA.dt).toFixed(1);
+    const did = verdict(mine) ? `${verdict(mine)} after ${seconds} s` : `stood until the end, for ${seconds} s`;
+    const shares = [mine, policy].map((robot) => (robot.over ? this.regret(robot) : ""));
+    const rival = shares[1] && `; ${policy.look.label}: ${shares[1]}`;
+    const link = document.createElement("a");
+    Object.assign(link, { className: "link", href: this.link, target: "_blank", textContent: "Link to this drive" });
+    const who = this.given ? "The driver" : "You";
+    const sentence = shares[0] ? `${who} ${did}: ${shares[0]}${rival}.` : `${who} ${did}.`;
+    this.find("text").replaceChildren(`${sentence} Who opens the link sees the drive: `, link);
   }
 
   /** A push for everyone. Where somebody has fallen, all start again first. */
@@ -118,9 +159,12 @@ class Playground extends Player {
   }
 
   tick(seconds, elapsed) {
-    if (!this.drag?.robot) {
+    const waits = this.countdown > 0;
+    if (waits && this.playing) this.countdown -= elapsed;
+    this.find("count").textContent = this.countdown > 0 ? Math.ceil(this.countdown) : "";
+    if (!waits && !this.drag?.robot) {
       this.late += seconds;
-      while (this.late >= DATA.dt) {
+      while (this.late >= DATA.dt && this.playing) {
         this.late -= DATA.dt;
         this.advance();
       }
@@ -197,9 +241,11 @@ class Playground extends Player {
     });
   }
 
-  /** How much more than the optimum an undisturbed robot has cost so far, or in all once its episode is over. */
+  /** How much more than the optimum an undisturbed robot has cost so far, or in all once its episode is over.
+   * Who drives is told the least regret that is still possible: what it has cost already, over the whole optimum. */
   regret(robot) {
     if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
+    if (this.driver && !robot.over) return `at least ${Math.max(0, 100 * (robot.cost / this.scenario.optimum - 1)).toFixed(0)} %`;
     const share = 100 * (robot.cost / (robot.over ? this.scenario.optimum : this.best.cost) - 1);
     // nothing costs less than the optimum over a whole episode
     return robot.over ? `regret ${Math.max(0, share).toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
