@@ -292,12 +292,16 @@ class BallbotBatch:
         """Holds forces for one control step; see `transition`. Call `reset` first.
 
         Raises:
-            ValueError: actions that are no tensor of real numbers of shape (B, 2), or (B, 3) with wheels.
+            ValueError: actions that are no tensor of real, finite numbers of shape (B, 2), or (B, 3) with wheels; the envs
+                stay as they are.
         """
         state = self.state
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         self._check_tensor(actions, (self.num_envs, self.params.action_size), "actions")
+        if not torch.isfinite(actions.detach()).all():
+            bad = (~torch.isfinite(actions.detach()).all(1)).nonzero().flatten()
+            raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
         try:
             self.state, result = self._run(state, actions)
         except Exception as error:

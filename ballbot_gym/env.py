@@ -29,7 +29,7 @@ from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.transition import Outcome, limit_names, outcome
+from ballbot_gym.tasks.transition import ENGINE, Outcome, limit_names, outcome
 from ballbot_gym.viewer import Viewer, has_viser, import_viser
 
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
@@ -127,6 +127,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
     the contact of a rolling ball: it slips or leaves the floor, and that by itself is no failure. `grip` is then the force at
     the end of the step.
 
+    Where the simulation of PyBullet or MuJoCo becomes unstable, the episode fails, and `violated` is the index of "engine".
+    The state is then the last one before.
+
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
@@ -198,7 +201,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self.history = check_history(history)
         self.observation_space = sensors.observation_space(self.task, self.params, self.history, self.observation)
         self._past = self._tried = np.zeros(0)  # the last observation with a history, and the action on it
-        self._physics_dt = physics_dt
+        self._physics_dt, self._may_lose = physics_dt, physics != "rk4"
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: step_code.Judge | None = None
         self._resets = 0
@@ -279,7 +282,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if self._remembers:
             self._tried = np.asarray(action, np.float64).clip(-1.0, 1.0).astype(_FLOAT32)
         before = self._state
-        self._state = x = self._simulator.step(total)
+        x = self._simulator.step(total)
+        lost = self._may_lose and (not math.isfinite(sum(x)) or self._simulator.is_unstable())
+        self._state = x = before if lost else x
         if self._sensors:
             z = tuple(self.np_random.random(sensors.DRAWS).tolist())
             self._sensors = sensors.following(
@@ -287,15 +292,16 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             )
         self._steps_left -= 1
         grip, kept = _NO_GRIP, 0.0
-        if self._grips:
-            grip, lost = self._grip(before, total)
-            kept = -1.0 if lost else 0.0
+        if self._grips and not lost:
+            grip, slips = self._grip(before, total)
+            kept = -1.0 if slips else 0.0
         self._taken = steps = self._steps - self._steps_left
         judge = self._judge
-        did = None if judge is None else judge.judge(before, force, x, steps, kept)
+        did = None if judge is None or lost else judge.judge(before, force, x, steps, kept)
         if did is None:
             judge = None
-            did = *outcome(self.task, before, force, x, self._constants, steps, (kept,)), dynamics.tilt(x)
+            end = outcome(self.task, before, force, x, self._constants, steps, (-1.0 if lost else kept,))
+            did = *(end._replace(violated=len(self.limit_names) - 1) if lost else end), dynamics.tilt(x)
         terminated = did[3] > 0
         if terminated:
             self._steps_left = 0
@@ -303,6 +309,11 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             self.render()
         seen, info = self._shown(judge, did, self._survive, force, clipped, grip)
         return seen, self._survive - did[1] + did[2], terminated, did[4] > 0, info
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        names = super().limit_names
+        return (*names, ENGINE) if self._may_lose else names
 
     @property
     def episode_params(self) -> BallbotParams:
@@ -472,7 +483,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         """The force, N, of an action, and whether it was clipped."""
         parts = real_array(action, "action", self._action_shape).tolist()
         limit = self._force_limit
-        if max(parts) <= 1.0 and min(parts) >= -1.0:
+        if max(parts) <= 1.0 and min(parts) >= -1.0 and math.isfinite(sum(parts)):  # max and min may pass over a NaN
             return tuple([limit * part for part in parts]), False
         if not all(map(math.isfinite, parts)):
             raise ValueError(f"action must be finite, not {parts}")

@@ -39,7 +39,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import ops
-from ballbot_gym.ops import Vector, is_number
+from ballbot_gym.ops import Vector, as_float, is_number
 
 _SIN = _COS = math.sqrt(0.5)  # of the zenith angle of the wheels' contacts
 _AZIMUTHS = tuple(math.radians(degrees) for degrees in (0, 120, 240))
@@ -74,7 +74,8 @@ class Wheels:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
+            value = as_float(getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
             if isinstance(value, str | bool | None):
                 raise ValueError(f"Wheels: {field.name} must be a number, not {value!r}")
             if not is_number(value):

@@ -144,6 +144,19 @@ def is_number(value: object) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
+def as_float(value: Any) -> Any:
+    """One real number, of NumPy too, as a float; anything else, such as a tensor or a symbol, as it is.
+
+    A whole number that is too large for a float stays what it is.
+    """
+    if not is_number(value) and not (isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"):
+        return value
+    try:
+        return float(value)
+    except OverflowError:
+        return value
+
+
 def is_positive(value: Any) -> bool:
     """Whether a real number is positive, and finite as a float: a whole number may be too large for one."""
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ballbot_gym import files
 from ballbot_gym.omni import Wheels
-from ballbot_gym.ops import is_number, is_positive
+from ballbot_gym.ops import as_float, is_number, is_positive
 
 _PACKAGE = Path(__file__).parent
 _IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf", _PACKAGE.parent / "urdf"
@@ -131,10 +131,11 @@ class BallbotParams(_Derived):
                 f"BallbotParams: wheels must be Wheels of a robot with rolls=True, or None, not {self.wheels!r}"
             )
         for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("rolls", "wheels") or (
-                field.name == "friction" and is_number(value) and value == math.inf
-            ):
+            if field.name in ("rolls", "wheels"):
+                continue
+            value = as_float(getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+            if field.name == "friction" and is_number(value) and value == math.inf:
                 continue
             if isinstance(value, _NO_NUMBER):
                 raise ValueError(f"BallbotParams: {field.name} must be a number, not {value!r}")

@@ -193,6 +193,10 @@ def simulate(
     """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit.
 
     `physics` is "bullet", "mujoco" or "rk4"; default, the first that is installed, as for environments.
+
+    Raises:
+        ValueError: a force is no finite number.
+        RuntimeError: the simulation becomes unstable.
     """
     simulator = make_simulator(checked_physics(physics), params, control_dt)
     x = np.asarray(x0, np.float64)
@@ -201,7 +205,11 @@ def simulate(
     states, forces = [x], []
     for k in range(round(duration / control_dt)):
         u = np.clip(controller.act(k * control_dt, x), -params.force_limit, params.force_limit)
+        if not np.isfinite(u).all():
+            raise ValueError(f"forces must be finite, not {u.tolist()} at {k * control_dt:g} s")
         x = np.array(simulator.step(tuple(u.tolist())))
+        if simulator.is_unstable() or not np.isfinite(x).all():
+            raise RuntimeError(f"the simulation is unstable from {k * control_dt:g} s on")
         forces.append(u)
         states.append(x)
     simulator.close()

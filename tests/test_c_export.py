@@ -172,3 +172,59 @@ def test_the_declarations_alone_can_be_included(tmp_path):
 def test_lqr_that_differs_from_episode_to_episode_is_refused(tmp_path):
     with pytest.raises(ValueError, match="export a policy"):
         export_c(LQR, tmp_path / "lqr.c", make_task("turn"))
+
+
+@pytest.mark.parametrize("flags", [(), ("-ffast-math",)], ids=str)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_state_that_is_no_number_gives_no_force_and_a_flag(bad, flags, tmp_path):
+    task = make_task("orbit")
+    network = random_policy(task, (8,), history=2)
+    source = export_c(save_policy(tmp_path / "mine", network, {}), tmp_path / "mine.c", task)
+    code = ctypes.CDLL(str(built(source, tmp_path / "mine.so", "-fPIC", "-shared", *flags)))
+    pointer = np.ctypeslib.ndpointer(np.float32)
+    code.ballbot_observe.argtypes, code.ballbot_act.argtypes = (
+        (pointer, pointer, ctypes.c_float, pointer),
+        (pointer,) * 2,
+    )
+    c = certified.load(task, default_params()).constants[0].astype(np.float32)
+    seen, action = np.zeros(len(task.observation_scale), np.float32), np.zeros(2, np.float32)
+
+    def acts(state, constants=c, t=0.0):
+        code.ballbot_observe(state, constants, t, seen)
+        return code.ballbot_act(seen, action), action.tolist()
+
+    good = np.full(8, 0.1, np.float32)
+    code.ballbot_reset()
+    first = acts(good)
+    assert first[0] == 0
+    for i in range(8):
+        state = good.copy()
+        state[i] = bad
+        assert acts(state) == (1, [0.0, 0.0])
+    assert acts(good, np.full_like(c, bad)) == (1, [0.0, 0.0])
+    assert acts(good, t=bad) == (1, [0.0, 0.0])
+    assert acts(good) == first  # its history is forgotten
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_a_filter_starts_anew_after_a_reading_that_is_no_number(bad, tmp_path):
+    export("lqr-ekf", task="stabilize", format="c", out=tmp_path / "filtered.c", robot="omni")
+    code = ctypes.CDLL(str(built(tmp_path / "filtered.c", tmp_path / "filtered.so", "-fPIC", "-shared")))
+    pointer = np.ctypeslib.ndpointer(np.float32)
+    code.ballbot_first_estimate.argtypes = code.ballbot_estimate.argtypes = (pointer,) * 3
+    state, place, action = np.zeros(11, np.float32), np.array([0.5, -0.2], np.float32), np.full(3, 0.1, np.float32)
+    sensors = np.array([0.01, 0.02, 0.0, 0.1, 0.2, 9.8, 0.0, 0.0, 0.0], np.float32)
+    code.ballbot_first_estimate(sensors, place, state)
+    first = state.copy()
+    for i, part in ((0, sensors), (8, sensors), (1, action)):
+        code.ballbot_first_estimate(sensors, place, state)
+        right, part[i] = part[i], bad
+        code.ballbot_estimate(sensors, action, state)
+        assert np.isnan(state).all()
+        part[i] = right
+        code.ballbot_estimate(sensors, action, state)
+        np.testing.assert_allclose(state, first, atol=1e-3)  # but the first estimate moved the place
+    code.ballbot_first_estimate(sensors, np.full(2, bad, np.float32), state)
+    assert np.isnan(state).all()
+    code.ballbot_estimate(sensors, action, state)
+    assert np.isfinite(state).all()

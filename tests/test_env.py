@@ -12,15 +12,20 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv, Randomization
+from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.params import default_params
+from ballbot_gym.robots import named_robot
+from ballbot_gym.rollout import simulate
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
+from ballbot_gym.vector import BallbotVectorEnv
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 UPRIGHT = np.zeros(8)
@@ -343,3 +348,68 @@ def test_render_before_reset_is_refused(make_env):
 
 if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes
     print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in installed_physics()}))
+
+
+@pytest.mark.parametrize("component", [0, 1, 2])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_no_component_of_an_action_may_be_other_than_finite(bad, component, physics):
+    actions = np.array([[0.5, 0.5, 0.5]] * 2)
+    actions[1, component] = bad
+    env = BallbotEnv("stabilize", physics=physics, robot="omni")
+    env.reset(seed=0)
+    before = env.get_state()
+    with pytest.raises(ValueError, match="action must be finite"):
+        env.step(actions[1])
+    assert env.get_state() == before
+    env.close()
+    for engine, kind in itertools.product(("native", "torch"), (np.float32, np.float64)):
+        envs = BallbotVectorEnv(2, "stabilize", robot="omni", engine=engine, compile="auto")
+        envs.reset(seed=0)
+        with pytest.raises(ValueError, match=r"finite; those of envs \[1\]"):
+            envs.step(actions.astype(kind))
+    batch = BallbotBatch("stabilize", 2, robot="omni", compile=False)
+    batch.reset(seed=0)
+    held = batch.state
+    with pytest.raises(ValueError, match=r"finite; those of envs \[1\]"):
+        batch.step(torch.as_tensor(actions))
+    assert batch.state is held
+
+
+@pytest.mark.parametrize("robot", ["paper", "rolling"])
+def test_an_unstable_simulation_fails_and_says_so(robot, physics, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    if physics == "rk4":
+        return  # no engine
+    env = BallbotEnv("stabilize", physics=physics, robot=replace(named_robot(robot), force_limit=1e30))
+    env.reset(seed=0)
+    for _ in range(env.task.steps):
+        before = env.get_state().x
+        seen, reward, terminated, _, info = env.step([1.0, 0.5])
+        if terminated:
+            break
+    assert (terminated, info["failure"], info["success"]) == (True, True, False)
+    if physics == "mujoco":
+        assert env.limit_names[info["violated"]] == "engine"
+        assert info["state"].tolist() == list(before)
+    assert np.isfinite(seen).all()
+    assert np.isfinite(reward)
+    assert env.reset(seed=0)[1]["violated"] == -1
+    env.step([0.0, 0.0])
+    env.close()
+    with pytest.raises(RuntimeError, match="unstable from 0 s on"):
+        simulate(_Pushing(), env.params, UPRIGHT, 0.1, physics="mujoco")
+
+
+class _Pushing:
+    def reset(self, t, x, c):
+        pass
+
+    def act(self, t, x):
+        return np.array([1e30, 0.0])
+
+
+def test_simulate_refuses_a_force_that_is_no_number(params):
+    pushing = _Pushing()
+    pushing.act = lambda t, x: np.array([0.0, math.nan])
+    with pytest.raises(ValueError, match="forces must be finite"):
+        simulate(pushing, params, UPRIGHT, 0.1, physics="rk4")

@@ -1,5 +1,7 @@
 import dataclasses
+from fractions import Fraction
 
+import numpy as np
 import pytest
 
 from ballbot_gym.params import URDF_PATH, BallbotParams, UrdfError, default_params
@@ -118,3 +120,13 @@ def test_unequal_force_limits_are_refused(tmp_path):
     path.write_text(text)
     with pytest.raises(UrdfError, match=r"one effort limit, not 300\.0 and 350\.0 N"):
         BallbotParams.from_urdf(path)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64, np.array, int, Fraction])
+def test_every_kind_of_number_is_a_float_in_the_robot_and_in_its_urdf(kind, params, tmp_path):
+    robot = dataclasses.replace(params, body_mass=kind(12), gravity=kind(9))
+    assert repr(robot) == repr(dataclasses.replace(params, body_mass=12.0, gravity=9.0))
+    (tmp_path / "robot.urdf").write_text(robot.to_urdf())
+    assert BallbotParams.from_urdf(tmp_path / "robot.urdf", gravity=9.0) == robot
+    wheels = dataclasses.replace(named_robot("omni").wheels, radius=kind(1))
+    assert repr(wheels.radius) == "1.0"

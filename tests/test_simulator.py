@@ -11,6 +11,7 @@ import pytest
 from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.engines.bullet import BulletSimulator
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import ROBOTS, named_robot
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
@@ -89,6 +90,13 @@ def test_robots_move_the_same_bit_for_bit_where_decimals_have_commas(name, physi
 def test_inertias_that_no_body_can_have_are_refused(params):
     with pytest.raises(ValueError, match="axial_inertia must be at most twice inertia"):
         replace(params, axial_inertia=3.0)  # of which Bullet would make 0
+
+
+def test_bullet_refuses_a_robot_whose_numbers_it_does_not_hold(params, monkeypatch):
+    written = BallbotParams.to_urdf
+    monkeypatch.setattr(BallbotParams, "to_urdf", lambda self: written(self).replace('"15.0"', '"fifteen"'))
+    with pytest.raises(RuntimeError, match=r"PyBullet took \(0.0"):
+        BulletSimulator(params, 0.02)
 
 
 @pytest.mark.parametrize("change", [{"gravity": 3.7}, {"body_mass": 9.0}, {"com_height": 0.4, "gravity": 3.7}], ids=str)

@@ -62,6 +62,7 @@ class BulletSimulator(Simulator):
         bullet.changeDynamics(
             self._robot, body, mass=params.body_mass, localInertiaDiagonal=inertia, physicsClientId=client
         )
+        self._check_held()
 
     def step(self, u: tuple[float, ...]) -> State:
         bullet, client, robot, joints = self._bullet, self._client, self._robot, self._joints
@@ -107,6 +108,21 @@ class BulletSimulator(Simulator):
         bullet.setJointMotorControlArray(
             robot, self._joints, bullet.VELOCITY_CONTROL, forces=none, physicsClientId=client
         )
+        self._check_held()
+
+    def _check_held(self) -> None:
+        """Raises a RuntimeError if PyBullet holds other masses, inertias or a lower centre of mass than the robot has."""
+        robot = self._params
+        ball, body = self._index["roll"] if robot.rolls else self._joints[1], self._joints[-1]
+        wanted = {
+            ball: (robot.ball_mass, *(robot.ball_inertia,) * 3 * robot.rolls),
+            body: (robot.body_mass, robot.inertia, robot.inertia, robot.axial_inertia, 0.0, 0.0, robot.com_height),
+        }
+        for link, numbers in wanted.items():
+            mass, _, inertia, place, *_ = self._bullet.getDynamicsInfo(self._robot, link, physicsClientId=self._client)
+            found = (mass, *inertia, *place)[: len(numbers)]
+            if any(not math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12) for a, b in zip(found, numbers, strict=True)):
+                raise RuntimeError(f"PyBullet took {found} for {numbers}, kg, kg·m² and m; it cannot simulate {robot}")
 
 
 class BulletContactSimulator(BulletSimulator):

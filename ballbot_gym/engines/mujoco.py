@@ -42,6 +42,11 @@ class MujocoSimulator(Simulator):
         self._dt = physics_dt
         self._mujoco = import_mujoco()
         self._mj_step = self._mujoco.mj_step
+        kinds = self._mujoco.mjtWarning
+        self._instabilities = [
+            int(kind)
+            for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_INERTIA)
+        ]
         self._make(params)
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
@@ -61,6 +66,13 @@ class MujocoSimulator(Simulator):
         self._mj_step(self._model, self._data, self._substeps)
         return (*self._positions.tolist(), *self._velocities.tolist())
 
+    def is_unstable(self) -> bool:
+        """Whether MuJoCo warned of numbers that are not finite or too large, or of a singular inertia.
+
+        After most of these warnings MuJoCo puts the robot back to its origin, at rest.
+        """
+        return bool(self._warned[self._instabilities].any())
+
     def _make(self, params: BallbotParams) -> None:
         self._params = params
         mujoco, spec = self._mujoco, self._mujoco.MjSpec()
@@ -74,7 +86,7 @@ class MujocoSimulator(Simulator):
         self._data = mujoco.MjData(self._model)
         # views of it, each of which takes longer to get than to use
         self._positions, self._velocities, self._pushed = self._data.qpos, self._data.qvel, self._data.qfrc_applied
-        self._twisted = self._data.xfrc_applied
+        self._twisted, self._warned = self._data.xfrc_applied, self._data.warning.number
 
     def _describe(self, spec: Any) -> None:
         """Adds the robot to an empty world."""

@@ -43,6 +43,10 @@ class Simulator(Protocol):
         """Velocity of the ball's lowest point over the floor, m/s; 0 where the ball cannot slip."""
         return 0.0, 0.0
 
+    def is_unstable(self) -> bool:
+        """Whether the engine gave up on the motion since the last reset, so that the state means nothing."""
+        return False
+
     def close(self) -> None:
         """Releases what the simulator holds; may be called again."""
 

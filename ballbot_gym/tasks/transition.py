@@ -13,6 +13,8 @@ from ballbot_gym.tasks.base import Task
 
 GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
+ENGINE = "engine"
+"""The limit that is violated where an engine's simulation is unstable, so that no state follows."""
 
 
 def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:

@@ -415,4 +415,10 @@ class Playground:
 
 def _failure_word(limit: str) -> str:
     """What a violated limit means, in words; "" for none."""
-    return {"": "", "tilt": "fell", "arena": "left the arena"}.get(limit, f"touched {limit}")
+    return {
+        "": "",
+        "tilt": "fell",
+        "arena": "left the arena",
+        "grip": "lost its grip",
+        "engine": "cannot be simulated on",
+    }.get(limit, f"touched {limit}")
