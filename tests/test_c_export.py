@@ -228,3 +228,33 @@ def test_a_filter_starts_anew_after_a_reading_that_is_no_number(bad, tmp_path):
     assert np.isnan(state).all()
     code.ballbot_estimate(sensors, action, state)
     assert np.isfinite(state).all()
+
+
+def test_two_controllers_are_in_one_program_of_c_or_cpp(tmp_path):
+    task = make_task("stabilize")
+    export_c(LQR, tmp_path / "left.c", task, prefix="left")
+    policy = save_policy(tmp_path / "mine", random_policy(task, (8,)), {})
+    export_c(policy, tmp_path / "right.c", task, prefix="right")
+    text = """
+        #define LEFT_HEADER
+        #define RIGHT_HEADER
+        #include "left.c"
+        #include "right.c"
+        int main(void) {
+            float state[8] = {1}, seen[LEFT_OBSERVATIONS], one[2], other[2];
+            left_reset(); right_reset();
+            left_observe(state, 0, 0, seen); left_act(seen, one); right_act(seen, other);
+            return one[0] == other[0];
+        }"""
+    for name in ("main.c", "main.cpp"):
+        (tmp_path / name).write_text(text)
+        language = "c++" if name.endswith("cpp") else "c"
+        for part in (name, "left.c", "right.c"):
+            subprocess.run(
+                [COMPILER, "-x", language, "-c", str(tmp_path / part), "-o", str(tmp_path / f"{part}.o")], check=True
+            )
+        objects = [str(tmp_path / f"{part}.o") for part in (name, "left.c", "right.c")]
+        subprocess.run([COMPILER, *objects, "-o", str(tmp_path / "program"), "-lm"], check=True)
+        subprocess.run([tmp_path / "program"], check=True)
+    with pytest.raises(ValueError, match="prefix must be small letters"):
+        export_c(LQR, tmp_path / "other.c", task, prefix="left leg")

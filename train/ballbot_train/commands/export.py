@@ -17,6 +17,7 @@ def export(
     format: Literal["onnx", "c"] = "onnx",
     out: Path | None = None,
     robot: RobotName = PAPER,
+    prefix: str = "ballbot",
 ) -> None:
     """Writes a policy as an ONNX or a C file, which needs neither Python nor torch to run.
 
@@ -31,6 +32,7 @@ def export(
         format: onnx or c.
         out: path of the file; default runs/export/TASK-POLICY with the ending .onnx or .c.
         robot: name of the policy's robot.
+        prefix: how the names in a C file begin; give each controller of one program another.
     """
     filtered = policy.endswith(FILTERED) and format == "c" and named_robot(robot).wheels is not None
     name, policy = file_part(policy), policy.removesuffix(FILTERED) if filtered else policy
@@ -41,7 +43,7 @@ def export(
     if format == "c":
         from ballbot_train.report.c_export import export_c  # it imports torch
 
-        written, how = export_c(source, path, problem, robot, filtered), "compiled with -DBALLBOT_TEST it checks itself"
+        written, how = export_c(source, path, problem, robot, filtered, prefix), f"-D{prefix.upper()}_TEST checks it"
     else:
         from ballbot_train.onnx_export import export_onnx  # it imports torch
 

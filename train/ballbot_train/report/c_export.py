@@ -4,6 +4,7 @@
 from the lines that Python runs; see `printed`.
 """
 
+import re
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,9 @@ from ballbot_train.weights import own_defaults
 LQR = "lqr"
 """What is exported by this name is LQR, and no policy's file."""
 
+PREFIX = "ballbot"
+"""How the names of functions begin, and in capitals those of macros."""
+
 LARGEST_ERROR = 1e-5
 """Of an action in the file's own test; float32 differs from Python by less."""
 
@@ -39,7 +43,14 @@ _TEST_STEPS = 16
 
 
 @own_defaults()
-def export_c(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER, filtered: bool = False) -> Path:
+def export_c(
+    policy: str | Path,
+    path: str | Path,
+    task: Task,
+    robot: str = PAPER,
+    filtered: bool = False,
+    prefix: str = PREFIX,
+) -> Path:
     """Writes a policy, or LQR, as a C file that observes and acts; its first lines say how to use it.
 
     Args:
@@ -48,17 +59,21 @@ def export_c(policy: str | Path, path: str | Path, task: Task, robot: str = PAPE
         task: what the policy was made for.
         robot: by name.
         filtered: with `kalman.SensorFilter` in front of it, which makes the state from sensors.
+        prefix: of all names that the file shows to others, so that one program can hold several controllers.
 
     Raises:
         PolicyError: as `load_network`; or the policy's actions are not finite.
         ValueError: the task's LQR, or where its filter expects to start, depends on the episode; or a frame or an observation
-            cannot be printed.
+            cannot be printed; or the prefix is no name in C.
     """
+    if not re.fullmatch("[a-z][a-z0-9_]{0,30}", prefix):
+        raise ValueError(f"prefix must be small letters, digits and underscores, as left_leg, not {prefix!r:.100}")
     if policy == LQR:
         network, about = lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
     else:
         network, about = load_network(policy, task, robot).eval(), metadata(policy, task, robot)
-    return files.write(path, _source(network, about, task, robot, filtered))
+    source = _source(network, about, task, robot, filtered)
+    return files.write(path, source.replace("ballbot_", f"{prefix}_").replace("BALLBOT_", f"{prefix.upper()}_"))
 
 
 def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:

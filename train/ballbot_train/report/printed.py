@@ -163,7 +163,7 @@ _C = _Language(
     lambda name: {"tanh": "squeezed"}.get(name, f"{name}f"),  # as exact, without branches
     c_number,
     "const float {0} = {1};",
-    "float {0}[{1}]; networks[{2}]((const float[]){{{3}}}, {0});",
+    "const float {0}_in[] = {{{3}}}; float {0}[{1}]; networks[{2}]({0}_in, {0});",
 )
 _C_IN_DOUBLE = _Language(str, _number, "const double {0} = {1};")
 
