@@ -11,7 +11,7 @@ from ballbot_gym.engines import make_simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names, outcome
-from ballbot_train.evaluation import recordings, steering
+from ballbot_train.evaluation import recordings
 
 TOLERANCE = 1e-6
 """Largest difference of a recorded state from the one that follows, m, rad and per second, where the state is all that
@@ -107,6 +107,8 @@ def _check_errors(
     cost: np.ndarray,
 ) -> None:
     """Refuses a recording whose small errors, taken together, may have changed the cost of an episode."""
+    from ballbot_train.evaluation import steering  # it imports CasADi
+
     ends = np.cumsum(steps.lengths)
     for i in np.flatnonzero(steps.lengths):
         n, first, end = steps.lengths[i], steps.first[i], ends[i]
