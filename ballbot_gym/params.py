@@ -288,6 +288,15 @@ class _Urdf:
 
     def check_alike(self, wanted: ElementTree.Element, rolls: bool) -> None:
         """Checks that every joint and link of a packaged URDF is here, with the same places, axes, masses and inertias."""
+        known = {(each.tag, each.get("name", "")) for each in wanted}
+        for link in self.root.findall("link"):
+            name = link.get("name", "")
+            mass = link.find("inertial/mass")
+            if ("link", name) not in known and mass is not None and _parts(mass.get("value", "")) != (0.0,):
+                raise self.error(
+                    f"link '{name}' has a mass, and the equations of motion know ball and body alone; add its mass, and what "
+                    "it does to the centre of mass and the inertias, to link 'body'"
+                )
         free = {("roll", "axis"), ("x", "origin")} | (set() if rolls else {("ball", "inertial/inertia")})
         for each in wanted:
             name = each.get("name", "")

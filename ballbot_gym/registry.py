@@ -18,10 +18,11 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, Robot, check_name, named_robot, register_robot, short_name
 from ballbot_gym.tasks import SHIPPED, TASKS, Task
+from ballbot_gym.tasks.checks import check_methods
 
 TASKS_GROUP, ROBOTS_GROUP = "ballbot_gym.tasks", "ballbot_gym.robots"
 """Groups of entry points. One of a task names its class; one of a robot names a function that calls `register_robot`."""
@@ -41,7 +42,7 @@ def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
 
     Raises:
         TypeError: it is no such class, or a method or an attribute is missing; the message names it.
-        ValueError: the name or the id is taken or malformed.
+        ValueError: the name or the id is taken or malformed, or a method gives what nothing can use.
     """
     _check_class(kind)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower() if name is None else name
@@ -60,6 +61,9 @@ def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
         raise ValueError(
             f"register_task: the id {kind.id} of {kind.__name__} is taken in Gymnasium; give it another id"
         )
+    if kind not in SHIPPED:
+        task = kind()
+        check_methods(task, default_params(), *task.sample(np.random.default_rng(0), default_params()))
     module = "" if kind in SHIPPED or kind.__module__ in _MAIN else f"{kind.__module__}:"
     gymnasium.registry.pop(kind.id, None)
     gymnasium.register(
@@ -174,9 +178,9 @@ def load_plugins() -> None:
             try:
                 found = entry.load()
                 register_task(found, entry.name) if group == TASKS_GROUP else found()
-            except Exception as error:
+            except (Exception, SystemExit) as error:  # a module that exits must not end whoever imports us
                 package = entry.dist.name if entry.dist else "a package"
-                warnings.warn(f"{package}: {group} {entry.name!r} ({entry.value}) fails: {error}", stacklevel=2)
+                warnings.warn(f"{package}: {group} {entry.name!r} ({entry.value}) fails: {error!r}", stacklevel=2)
 
 
 def registered() -> tuple[tuple[str, ...], dict[str, Robot]]:

@@ -73,7 +73,8 @@ def short_name(name: str) -> str:
     """The name of a task or robot, from MODULE:NAME as Gymnasium's ids have it: the module, which registers it, is imported.
 
     Raises:
-        ValueError: there is no such module.
+        ValueError: there is no such module, or it exits when it is imported.
+        ModuleNotFoundError: the module imports another that is not installed.
     """
     module, colon, short = name.rpartition(":")
     if colon:
@@ -81,8 +82,14 @@ def short_name(name: str) -> str:
             import_module(module)
         except ModuleNotFoundError as error:
             if not f"{module}.".startswith(f"{error.name}."):
-                raise
+                raise ModuleNotFoundError(
+                    f"{name}: the module {module!r} imports {error.name!r}, which is not installed", name=error.name
+                ) from error
             raise ValueError(f"{name}: no module {error.name!r} is installed or in {os.getcwd()}") from None
+        except SystemExit:
+            raise ValueError(
+                f'{name}: the module {module!r} exits when it is imported; put what it runs under if __name__ == "__main__"'
+            ) from None
     return short
 
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import tomllib
 
+from ballbot_baselines.lqr import LqrController, equilibrium_gain
 from ballbot_gym import TASKS, Task, certified, files, named_robot, register_robot, register_task
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
-from ballbot_gym.params import URDF_PATH
+from ballbot_gym.params import URDF_PATH, BallbotParams, UrdfError
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -252,7 +253,7 @@ def test_a_new_package_passes_its_own_tests(typed, tmp_path):
     ended, printed = typed("new", "task", "figure_eight", "--episodes", 1)
     assert ended == 0, printed
     folder = tmp_path / "figure_eight"
-    assert "| figure_eight | trajopt | 100.0 % | 0/1 |" in (folder / "leaderboard.md").read_text()
+    assert "| figure_eight | trajopt | bullet | 100.0 % | 0/1 |" in (folder / "leaderboard.md").read_text()
     entry = tomllib.loads((folder / "pyproject.toml").read_text())["project"]["entry-points"]["ballbot_gym.tasks"]
     assert entry == {"figure_eight": "ballbot_figure_eight:FigureEight"}
     ran = subprocess.run([sys.executable, "-m", "pytest", "-q"], cwd=folder, capture_output=True, text=True)
@@ -271,7 +272,90 @@ def test_a_new_package_needs_a_name_of_its_own(name, typed, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["none", "true", "reference", "any", "value_error", "gym", "turn_"])
+def test_a_new_package_has_a_class_and_a_module_that_nothing_else_has(name, typed, tmp_path):
+    ended, printed = typed("new", "task", name)
+    assert (ended, "give another name" in printed) == (1, True)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("file", ["2024-ballbot.urdf", "Löwe.urdf", "_x.urdf"])
+def test_every_name_of_a_robot_s_file_will_do(file, typed, light, tmp_path):
+    light.rename(tmp_path / file)
+    words = "--task stabilize --format c --out lqr.c --robot"
+    ended, printed = typed("export", "lqr", *words.split(), file)
+    assert ended == 0, printed
+
+
+def test_a_payload_on_a_fixed_joint_is_refused(light):
+    text = light.read_text()
+    payload = (
+        '<link name="payload"><inertial><mass value="3"/></inertial></link><joint name="holds" type="fixed">'
+        '<parent link="body"/><child link="payload"/></joint></robot>'
+    )
+    light.write_text(text.replace("</robot>", payload))
+    with pytest.raises(UrdfError, match=r"link 'payload' has a mass.*add its mass.*to link 'body'"):
+        register_robot("laden", light)
+    light.write_text(text.replace("</robot>", '<link name="camera"/></robot>'))
+    assert BallbotParams.from_urdf(light).body_mass == 10.0
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("import no_such_library", "imports 'no_such_library', which is not installed"),
+        ("raise SystemExit(3)", "exits when it is imported"),
+    ],
+)
+def test_a_module_that_cannot_be_imported_is_blamed_itself(line, message, typed, tmp_path):
+    module = f"faulty_{line.partition(' ')[0]}"
+    (tmp_path / f"{module}.py").write_text(line)
+    ended, printed = typed("evaluate", "lqr", "--task", f"{module}:mine")
+    assert ended == 1
+    assert message in printed
+    assert "pip install" not in printed
+
+
+def test_a_plugin_that_exits_does_not_end_the_import(tmp_path):
+    (tmp_path / "exits.py").write_text("raise SystemExit(3)")
+    folder = tmp_path / "exits-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: exits\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[ballbot_gym.tasks]\nmine = exits:Mine\n")
+    ran = subprocess.run(
+        [sys.executable, "-c", "import ballbot_gym; print('imported')"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert ran.stdout.strip() == "imported"
+    assert "exits: ballbot_gym.tasks 'mine' (exits:Mine) fails: SystemExit(3)" in ran.stderr
+
+
+def test_lqr_without_a_gain_fails_its_episodes_and_says_why(interpreted):
+    flat = type(
+        "Flat", (Stabilize,), {"id": "Flat-v0", "cost": lambda self, x, u, c: 1.0 + 1e-5 * (u[0] ** 2 + u[1] ** 2)}
+    )
+    task, robot = flat(duration=2.0), named_robot("paper")
+    with pytest.raises(PlanError, match=r"LQR of Flat-v0 has no gain.*Flat.cost must grow"):
+        LqrController(task, robot).reset(0.0, np.zeros(8), np.zeros(0))
+    assert equilibrium_gain(task, robot) is None
+
+
 FAULTS = {
+    "None": ({"cost": lambda self, x, u, c: None}, r"Wrong.cost gives None .*with `return`"),
+    "zero": ({"cost": lambda self, x, u, c: 0.0 * u[..., 0]}, "Wrong.cost gives 0 for every state and force"),
+    "random": ({"cost": lambda self, x, u, c: np.random.rand()}, r"Wrong.cost gives .* for the same x, u and c"),
+    "seven": ({"draw_state": lambda self, z, c, params: (0.0,) * 7}, "Wrong.draw_state gives 7 numbers"),
+    "random start": (
+        {"draw_state": lambda self, z, c, params: (*np.random.rand(2) / 10, *(0.0,) * 6)},
+        "Wrong.draw_state gives other states for the same z",
+    ),
+    "sample": ({"sample": lambda self, rng, params: (np.zeros(8), np.zeros(0))}, "Wrong.sample is never called"),
+    "no guess": ({"guess_paths": lambda self, x, c, params: []}, r"Wrong.guess_paths gives \[\] .*at least one"),
+    "unnamed": (
+        {"margins": lambda self, x, c: (1.0, 1.0)},
+        "Wrong.margins gives 2 limits, and margin_names names 1",
+    ),
+    "goal": ({"goal": lambda self, x, c: x[..., 0]}, "Wrong.goal gives .*give a tuple"),
+    "observation": ({"observe": lambda self, x, c: x[..., :3]}, r"Wrong.observe gives the shape \(3,\)"),
     "NaN": ({"cost": lambda self, x, u, c: math.nan * x[..., 0]}, r"Wrong.cost gives nan without force"),
     "negative": ({"cost": lambda self, x, u, c: -u[..., 0]}, r"Wrong.cost gives -0 without force and -35 with one"),
     "start": (
@@ -291,6 +375,11 @@ def test_a_task_that_no_optimizer_can_use_is_refused_by_the_name_of_its_method(n
     task = type("Wrong", (Stabilize,), {"id": "Wrong-v0", **methods})()
     with pytest.raises(ValueError, match=message):
         optima.known(task, "paper", [0])
+    if name not in ("start", "guess", "no guess"):  # which depend on the robot
+        before = dict(TASKS)
+        with pytest.raises(ValueError, match=message):
+            register_task(type(task), "wrong")
+        assert before == TASKS
 
 
 def test_a_task_is_known_by_its_id_wherever_its_name_is(make_env):

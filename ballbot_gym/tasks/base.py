@@ -152,6 +152,8 @@ class Task(ABC):
     def start(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         """As `draw_state`, with all components that the robot has: with wheels it neither turns nor spins at the start."""
         x = self.draw_state(z, c, params)
+        if len(x) not in (8, params.state_size):
+            raise ValueError(f"{type(self).__name__}.draw_state gives {len(x)} numbers; give the 8 of dynamics.STATE")
         return (*x, *(0.0 * x[0],) * (params.state_size - len(x)))
 
     def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
 from ballbot_baselines.shooting import RobotKind, kind_of, ocp_of
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 MARGIN = 2e-5
@@ -137,7 +138,10 @@ def rest(task: Task, params: BallbotParams) -> Rest | None:
         end = task.reference(x0, c, params)
         if len(end.x) > 1 or not is_equilibrium(params, end.x[0], end.u[0]):
             return None
-        found.append(Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))
+        try:
+            found.append(Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))
+        except PlanError:
+            return None
     return found[0] if np.allclose(found[0].p, found[-1].p, rtol=1e-9) else None
 
 

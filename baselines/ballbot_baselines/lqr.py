@@ -12,6 +12,7 @@ import scipy.linalg
 from ballbot_baselines.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
 from ballbot_gym import dynamics, omni
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Reference, Task
 
 _MAX_ROUNDS = 50  # around a closed motion until the Riccati equation is periodic
@@ -29,9 +30,19 @@ class Gains:
 def discrete_lqr(
     task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx."""
+    """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx.
+
+    Raises:
+        PlanError: the cost rate has no curvature there in the state or in the force, so that LQR has no gain.
+    """
     a, b, q, r = (matrix[0] for matrix in _steps(task, params, x[None], u[None], c, t))
-    p = scipy.linalg.solve_discrete_are(a, b, q, r)
+    try:
+        p = scipy.linalg.solve_discrete_are(a, b, q, r)
+    except np.linalg.LinAlgError:
+        raise PlanError(
+            f"LQR of {task.id} has no gain where its reference rests: {type(task).__name__}.cost must grow there with the "
+            "square of the error of the state and of the force"
+        ) from None
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 
 
@@ -41,7 +52,7 @@ def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.
     Returns:
         The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
         of such a task are the scaled errors of the state. With wheels all no observations count: (3, no) and (no, no). None
-        for every other task.
+        for every other task, and where LQR has no gain.
     """
     if task.clock:
         return None
@@ -50,7 +61,10 @@ def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.
     if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
         return None
     (x,), (u,) = omni.with_wheels(params, reference.x, reference.u)
-    k, p = discrete_lqr(task, params, x, u, c)
+    try:
+        k, p = discrete_lqr(task, params, x, u, c)
+    except PlanError:
+        return None
     of_observation = np.zeros((len(x), 8 if params.wheels is None else task.observation_size(params)))
     of_observation[range(8), range(8)] = task.observation_scale[:8]
     if params.wheels is not None:  # sin ψ, and the others as `Task.seen` scales them
@@ -120,7 +134,7 @@ def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.
         if np.allclose(after, gains.p[0], rtol=1e-6):
             return gains
         after = gains.p[0]
-    raise RuntimeError(f"LQR around the closed motion of {task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
+    raise PlanError(f"LQR around the closed motion of {task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
 
 
 def _steps(

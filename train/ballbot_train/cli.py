@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,11 @@ def _run(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         from ballbot_gym.lazy import install
 
-        hint = "" if "pip install" in str(error) else f"; the commands need {install('train')}"
+        hint = (
+            ""
+            if "pip install" in str(error) or not _imported_by_us(error)
+            else f"; the commands need {install('train')}"
+        )
         errors.print(f"ballbot: {error}{hint}", style="red")
         return 1
     except (ValueError, TypeError, ImportError, OSError, *_expected()) as error:
@@ -117,7 +122,8 @@ def _registered(options: list[str]) -> list[str]:
             word = short_name(word)
         elif word.endswith(".urdf") and "--robot" in (flag, *named[-1:]):
             path = Path(word)
-            word = re.sub(r"\W", "_", path.stem.lower())
+            word = re.sub("[^a-z0-9_]", "_", path.stem.lower())
+            word = word if word[:1].isalpha() else f"robot_{word}"
             register_robot(word, path)
         elif _ID.fullmatch(word) and "--out" not in (flag, *named[-1:]):
             from ballbot_gym.tasks import TASKS
@@ -127,6 +133,15 @@ def _registered(options: list[str]) -> list[str]:
             word = "bullet"
         named.append(f"{flag}{equals}{word}")
     return named
+
+
+def _imported_by_us(error: BaseException) -> bool:
+    """Whether the import that failed is in a file of ours, and not in one of the user's or of a library."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    *_, last = [name for name in modules if not name.startswith("importlib")]
+    return last == "__main__" or last.partition(".")[0] in ("ballbot_gym", "ballbot_baselines", "ballbot_train")
 
 
 def _again(command: str, options: list[str]) -> str:

@@ -1,10 +1,15 @@
 """`ballbot new`: a package for a task of one's own."""
 
+import builtins
+import keyword
 import os
+import re
 import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Literal
+
+import gymnasium
 
 from ballbot_gym import files
 from ballbot_gym.robots import check_name
@@ -15,6 +20,7 @@ from ballbot_train.evaluation.results import HEADER, cells
 
 _TEMPLATES = Path(__file__).parent.parent / "template"
 _FIRST = ("lqr", "trajopt")
+_OURS = ("ballbot_gym", "ballbot_baselines", "ballbot_train")
 
 
 def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: int = 8) -> None:
@@ -29,10 +35,12 @@ def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: 
     del kind  # there is one
     check_name(name, "task")
     check_least(0, episodes=episodes)
-    if name in TASKS:
-        raise ValueError(f"there is a task {name!r} already; give another name")
-    out = Path(name) if out is None else out
+    if name in TASKS or id_of(name) in gymnasium.registry or module_of(name) in _OURS:
+        raise ValueError(f"there is a task {name!r} already, or a package of ours of that name; give another name")
     texts = files_of(name)
+    if (called := kind_of(name)) in _names_in(texts[f"{module_of(name)}.py"]):
+        raise ValueError(f"the task's class would be {called!r}, which means something else there; give another name")
+    out = Path(name) if out is None else out
     if there := [path for path in (*texts, "leaderboard.md") if (out / path).exists()]:
         raise ValueError(f"{out / there[0]} exists; give another --out")
     for path, text in texts.items():
@@ -46,9 +54,8 @@ def files_of(name: str) -> dict[str, str]:
     """The files of a task's package by their names, as text."""
     import jinja2  # no other command needs it
 
-    kind = "".join(part.capitalize() for part in name.split("_"))
     module = module_of(name)
-    values = {"name": name, "kind": kind, "module": module, "id": f"Ballbot{kind}-v0"}
+    values = {"name": name, "kind": kind_of(name), "module": module, "id": id_of(name)}
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
@@ -64,6 +71,21 @@ def files_of(name: str) -> dict[str, str]:
 def module_of(name: str) -> str:
     """The module of a task's package."""
     return f"ballbot_{name}"
+
+
+def kind_of(name: str) -> str:
+    """The class of a task's package."""
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def id_of(name: str) -> str:
+    """The Gymnasium id of a task's package."""
+    return f"Ballbot{kind_of(name)}-v0"
+
+
+def _names_in(source: str) -> set[str]:
+    """Words that a module cannot give to a class of its own: Python's, and what the module imports."""
+    return {*keyword.kwlist, *dir(builtins), *re.findall(r"\w+", " ".join(re.findall(r"import (.*)", source)))}
 
 
 def _leaderboard(name: str, out: Path, episodes: int) -> str:

@@ -4,12 +4,9 @@ Importing this module is light: CasADi is imported when an optimum is computed.
 """
 
 import itertools
-import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
-
-import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.certified import cache
@@ -21,6 +18,7 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER, checked_robot, file_name, robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.checks import check_methods, check_paths
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bars
 from ballbot_train.executors import Workers, completed
@@ -134,20 +132,10 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
     """Raises a ValueError that names the method of a task with which an episode cannot even begin."""
     kind, where = type(task).__name__, f"at the start of episode {index}"
     x, c = cache.episode(task, params, index)
-    begin = task.at(c, 0.0)
-    if violated := task.violated(x, begin):  # as a state does that is not finite
+    check_methods(task, params, x, c, where)
+    if violated := task.violated(x, task.at(c, 0.0)):  # as a state does that is not finite
         raise ValueError(f"{kind}.draw_state draws {x.tolist()} {where}, which is beyond the limit of {violated}")
-    force = np.full(params.action_size, 0.1 * params.force_limit)
-    cost, more = (float(task.cost(x, u, begin)) for u in (0 * force, force))
-    if not (0 <= cost < math.inf and 0 <= more < math.inf):
-        raise ValueError(
-            f"{kind}.cost gives {cost:g} without force and {more:g} with one {where}; make it finite and ≥ 0"
-        )
-    for path in task.guess_paths(x, c, params):
-        if np.shape(path)[1:] != (2,) or len(path) < 2 or not np.isfinite(path).all():
-            raise ValueError(
-                f"{kind}.guess_paths gives the shape {np.shape(path)} {where}; give finite (n+1, 2) positions, m"
-            )
+    check_paths(task, params, x, c, where)
 
 
 def _solved(solve: Callable[[list[int]], Iterator[Any]], part: list[int]) -> list[Any]:
