@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import secrets
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -160,12 +161,21 @@ def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None, most: f
 
 
 def write(path: str | Path, content: bytes | str) -> Path:
-    """Writes content under a temporary name in the same folder, made if missing, and renames it."""
+    """Writes content under a temporary name in the same folder, made if missing, and renames it.
+
+    Raises:
+        FileError: a device, a pipe or a folder has this name, which a file would replace.
+    """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise FileError(f"{path} is no regular file, and is not replaced by one; give another path")
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # a name that nobody can guess, and a file that was not there: another user's link would lead to another file
+    unfinished = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     try:
-        unfinished.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+        with open(os.open(unfinished, flags, 0o666), "wb") as file:
+            file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)

@@ -91,11 +91,20 @@ def _make_private(folder: Path) -> None:
         PermissionError: the folder belongs to another user, or others may write into it.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    check_private(folder, "BALLBOT_CACHE")
+
+
+def check_private(folder: Path, variable: str) -> None:
+    """Checks that nobody else can put files into a folder, which the environment variable names.
+
+    Raises:
+        PermissionError: the folder belongs to another user, or others may write into it.
+    """
     if os.name != "posix":
         return
     status = folder.stat()
     if status.st_uid != os.geteuid():
-        raise PermissionError(f"{folder} belongs to another user; set BALLBOT_CACHE to a folder of your own")
+        raise PermissionError(f"{folder} belongs to another user; set {variable} to a folder of your own")
     if status.st_mode & _WRITABLE_BY_OTHERS:
         raise PermissionError(f'others may write into {folder}; run "chmod go-w" on it')
 
@@ -121,11 +130,19 @@ def _run(command: list[str], seconds: float, check: bool) -> str:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether the library is there and as it was built: loading a damaged one would kill the process."""
+    """Whether the library is there, this user's own, and as it was built: loading a damaged one would kill the process.
+
+    A folder that others could once write into may still hold their files. These are built again.
+    """
     try:
-        content = path.read_bytes()
+        status = path.lstat()
     except FileNotFoundError:
         return False
+    if not stat.S_ISREG(status.st_mode):
+        return False
+    if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & _WRITABLE_BY_OTHERS):
+        return False
+    content = path.read_bytes()
     return hashlib.sha256(content[:-_DIGEST]).digest() == content[-_DIGEST:]
 
 

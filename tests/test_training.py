@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields, replace
 
 import pytest
@@ -105,12 +106,13 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed, monkeypatch):
     assert (ended, "holds a run of seed" in printed) == (1, True), printed
 
 
-def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder(tmp_path, typed, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder(tmp_path, typed, monkeypatch, number):
     iterate = shac.Shac.iterate
 
     def interrupted(self):
         if self.iteration == 3:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return iterate(self)
 
     with monkeypatch.context() as patch:
@@ -267,3 +269,10 @@ def test_a_task_that_no_learner_knows_trains_with_default_settings(learner, monk
     after = parameters(made)
     assert torch.isfinite(after).all()
     assert not torch.equal(before, after)
+
+
+def test_a_training_in_another_thread_comes_to_its_end(short_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "score_and_validate", lambda *policy: measured(1.5, 30.0, 1.0))
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(short_run).result()
+    assert (tmp_path / "policy.json").exists()

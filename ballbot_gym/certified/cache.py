@@ -55,13 +55,19 @@ def folder(task: Task, params: BallbotParams, randomization: Randomization = Ran
     """Where the optima of a problem are kept: in $BALLBOT_OPTIMA, or the folder `optima` of the user's cache.
 
     Raises:
-        ValueError: $BALLBOT_OPTIMA or $BALLBOT_CACHE is no absolute path.
+        ValueError: $BALLBOT_OPTIMA or $BALLBOT_CACHE is no absolute path; or others may write into $BALLBOT_OPTIMA, where a
+            poor motion would pass for the optimum.
     """
     base = Path(os.environ.get("BALLBOT_OPTIMA") or machine_code.cache_folder() / "optima")
     if not base.is_absolute():
         raise ValueError(
             f"BALLBOT_OPTIMA must be an absolute path, not {str(base)!r}; unset it for the user's cache folder"
         )
+    if os.environ.get("BALLBOT_OPTIMA") and base.exists():
+        try:
+            machine_code.check_private(base, "BALLBOT_OPTIMA")
+        except PermissionError as error:
+            raise ValueError(str(error)) from error
     return base / f"{type(task).__name__}-{_digest(task, params, randomization)}"
 
 

@@ -35,6 +35,7 @@ import math
 import os
 import shlex
 import signal
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -358,8 +359,15 @@ class _Run:
 
 @contextmanager
 def _interruptible() -> Iterator[Any]:
-    """Yields a function that says whether Ctrl-C was pressed. The first Ctrl-C interrupts nothing; a second one does."""
+    """Yields a function that says whether the run is to stop: after Ctrl-C, or SIGTERM, as cluster schedulers send it.
+
+    The first of them interrupts nothing; a second one does. Python delivers signals to the main thread alone, so in another
+    thread nothing is caught.
+    """
     pressed: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
 
     def on_signal(number: int, frame: object) -> None:
         if pressed:
@@ -367,8 +375,9 @@ def _interruptible() -> Iterator[Any]:
         pressed.append(number)
         console.print("saving; press Ctrl-C again to stop at once")
 
-    before = signal.signal(signal.SIGINT, on_signal)
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(pressed)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
