@@ -107,3 +107,12 @@ def test_shipped_policies_say_their_robot_and_observation() -> None:
             for path in shipped_policies(make_task(name, robot), robot, None).values():
                 spec = PolicySpec.read(read_description(path)["spec"])
                 assert spec == spec.on(make_task(name, robot), robot)
+
+
+def test_a_runs_folder_is_its_policy_and_a_checkpoint_of_others_is_named(tmp_path: Path) -> None:
+    run = tmp_path / "run-1"
+    save_policy(run / "policy", PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))), {})
+    rows = [evaluate(path, "stabilize", 1, "rk4").cost_mean for path in (str(run), run / "policy.json")]
+    assert rows[0] == rows[1]
+    with pytest.raises(PolicyError, match=r"model_100\.pt is no policy's \.json, nor a model of Stable-Baselines3"):
+        evaluate("model_100.pt", "stabilize", 1, "rk4")

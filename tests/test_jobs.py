@@ -213,3 +213,9 @@ class Unpicklable(ValueError):
 def test_an_error_of_a_worker_is_the_error_of_the_run_whatever_it_holds(tmp_path):
     with pytest.raises(RuntimeError, match="Unpicklable"):
         jobs.run([jobs.Job("job", unpicklable, (), (0, 1))], tmp_path, 2, ignore)
+
+
+def test_of_nested_settings_only_those_that_differ_are_named(tmp_path):
+    held = {"seed": 1, "settings": {"gamma": 0.99, "hidden": [64, 64]}}
+    with pytest.raises(ValueError, match=r"holds a run of settings gamma 0\.99, not 0\.98; give another --out"):
+        jobs.check_same(held, {"seed": 1, "settings": {"gamma": 0.98, "hidden": (64, 64)}}, tmp_path, "a run")

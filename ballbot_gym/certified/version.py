@@ -21,10 +21,11 @@ def digest() -> str:
     from ballbot_gym import certified, identity
     from ballbot_gym.env import make_task
     from ballbot_gym.robots import PAPER, named_robot
+    from ballbot_gym.tasks import SHIPPED
 
     robot, parts = named_robot(PAPER), []
-    for name in ("stabilize", "turn", "orbit", "weave"):
-        task, known = make_task(name, PAPER), certified.load(name, PAPER)
+    for kind in SHIPPED:
+        task, known = make_task(kind.id, PAPER), certified.load(kind.id, PAPER)
         numbers = [*known.states.ravel(), *known.constants.ravel(), *known.costs]
         parts.append([identity.problem_digest(task, robot), [f"{value:.9g}" for value in numbers]])
     return identity.digest(parts)

@@ -187,6 +187,11 @@ def read_description(path: str | Path) -> dict[str, Any]:
         PolicyError: it is missing or damaged.
     """
     _, description = paths_of(path)
+    if Path(path).suffix in (".pt", ".pth", ".ckpt"):
+        raise PolicyError(
+            f"{path} is no policy's .json, nor a model of Stable-Baselines3 in a .zip: load it where it was made, and give "
+            "ballbot_train.evaluate a function from observation to action"
+        )
     try:
         read = files.read_json(description, _DESCRIPTION_LIMIT)
         if not isinstance(read["spec"], dict):
@@ -252,8 +257,15 @@ def weights_digest(path: str | Path) -> str:
         raise PolicyError(f"{weights} is not a policy: {error}") from error
 
 
+def is_run(path: Path) -> bool:
+    """Whether a path is the folder of a training run that has a policy."""
+    return (path / "policy.json").is_file()
+
+
 def paths_of(path: str | Path) -> tuple[Path, Path]:
-    """The paths of a policy's weights and of its description, given either of them or the name without an ending."""
+    """The paths of a policy's weights and of its description, given either, the name without an ending, or a run's folder."""
     path = Path(path)
+    if is_run(path):
+        path = path / "policy"
     stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
     return stem.with_name(stem.name + ".safetensors"), stem.with_name(stem.name + ".json")

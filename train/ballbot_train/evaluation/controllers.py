@@ -9,7 +9,7 @@ from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
-from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
+from ballbot_train.policy_files import is_run, read_description, shipped_policies, weights_digest
 
 FILTERED = "-ekf"
 """Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
@@ -41,8 +41,9 @@ def is_expert(name: str) -> bool:
 
 
 def is_file(name: str) -> bool:
-    """Whether a controller's name is the path of a policy file or of a saved model."""
-    return not is_expert(name) and bool(Path(plain(name)).suffix)
+    """Whether a controller's name is the path of a policy file, of a run's folder with one, or of a saved model."""
+    path = Path(plain(name))
+    return not is_expert(name) and (bool(path.suffix) or (path.name != plain(name) and is_run(path)))
 
 
 def is_saved_model(name: str) -> bool:
