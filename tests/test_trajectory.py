@@ -101,16 +101,17 @@ def test_arrays_that_are_no_trajectory_are_refused(change, problem):
         Trajectory(**{**GOOD, **change})
 
 
-@pytest.mark.parametrize("method", ["replace", "write_bytes"])
-def test_write_that_fails_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, method):
+@pytest.mark.parametrize("name", ["pathlib.Path.replace", "builtins.open"])
+def test_write_that_fails_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, name):
     path = files.write(tmp_path / "kept.txt", "old")
 
-    def fail(self, *args):
+    def fail(*args):
         raise OSError("disk full")
 
-    monkeypatch.setattr(Path, method, fail)
-    with pytest.raises(OSError, match="disk full"):
-        files.write(path, "new")
+    with monkeypatch.context() as patch:
+        patch.setattr(name, fail)
+        with pytest.raises(OSError, match="disk full"):
+            files.write(path, "new")
     assert [p.name for p in tmp_path.iterdir()] == ["kept.txt"]
     assert path.read_text() == "old"
 

@@ -85,7 +85,9 @@ def id_of(name: str) -> str:
 
 def _names_in(source: str) -> set[str]:
     """Words that a module cannot give to a class of its own: Python's, and what the module imports."""
-    return {*keyword.kwlist, *dir(builtins), *re.findall(r"\w+", " ".join(re.findall(r"import (.*)", source)))}
+    # not by a parser, because a source with a bad name may not parse
+    imported = re.findall(r"import (\([^)]*\)|.*)", source)
+    return {*keyword.kwlist, *dir(builtins), *re.findall(r"\w+", " ".join(imported))}
 
 
 def _leaderboard(name: str, out: Path, episodes: int) -> str:
