@@ -392,3 +392,13 @@ def test_the_rows_of_lqr_are_what_it_does_today(task, tmp_path):
     _, results = read_results(tmp_path)
     # the motion is unstable, so that other machines' rounding grows over an episode
     assert entry.costs[:2] == pytest.approx([result.cost for result in results], rel=1e-4)
+
+
+def test_a_row_is_not_overwritten_by_another_submission_of_its_name(submitted, tmp_path):
+    entry = verify(submitted()[1], EPISODES)
+    row = entry.write(tmp_path)
+    assert entry.write(tmp_path) == row
+    before = row.read_bytes()
+    with pytest.raises(SubmissionError, match="is the row of another submission of this name"):
+        replace(entry, submission="0" * 64).write(tmp_path)
+    assert row.read_bytes() == before

@@ -107,7 +107,17 @@ class Entry:
         return recordings.file_of(self.task, self.robot, self.name, ".json", physics)
 
     def write(self, folder: Path) -> Path:
-        """Writes it as JSON."""
+        """Writes it as JSON.
+
+        Raises:
+            SubmissionError: the row of another submission has this name.
+        """
+        path = folder / self.file
+        if path.exists() and files.read_json(path).get("submission") != self.submission:
+            raise SubmissionError(
+                f"{path} is the row of another submission of this name; submit under another --name, or delete that row "
+                "first if it is yours"
+            )
         return files.write(folder / self.file, to_json(asdict(self)))
 
 
