@@ -72,8 +72,7 @@ def export_c(
         network, about = lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
     else:
         network, about = load_network(policy, task, robot).eval(), metadata(policy, task, robot)
-    source = _source(network, about, task, robot, filtered)
-    return files.write(path, source.replace("ballbot_", f"{prefix}_").replace("BALLBOT_", f"{prefix.upper()}_"))
+    return files.write(path, _source(network, about, task, robot, filtered, prefix))
 
 
 def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
@@ -92,10 +91,11 @@ def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
     return network.eval()
 
 
-def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool) -> str:
+def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool, prefix: str) -> str:
     spec, params, networks = network.spec, named_robot(robot), layers_of(network)
     source = render(
         "controller.c.j2",
+        prefix=prefix,
         # lines of a C comment, which no text from a file can end
         about=printable("\n".join(f"{name}: {value}" for name, value in about.items())).replace("*", "×"),
         spec=spec,
