@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks import Task
 
 _PROBES = 8  # states and episodes at which a task is compared
@@ -54,6 +56,11 @@ def problem_digest(task: Task, params: BallbotParams) -> str:
     episodes = [[_rounded(part) for part in task.sample(rng, params)] for _ in range(_PROBES)]
     fields = [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit]
     return digest(fields, robot_digest(params), values, episodes)
+
+
+def named_problem_digest(task: str, robot: str) -> str:
+    """`problem_digest` of a task and a robot by name."""
+    return problem_digest(make_task(task, robot), named_robot(robot))
 
 
 def _probes(task: Task, params: BallbotParams) -> Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -94,19 +94,19 @@ def _make_private(folder: Path) -> None:
     check_private(folder, "BALLBOT_CACHE")
 
 
-def check_private(folder: Path, variable: str) -> None:
-    """Checks that nobody else can put files into a folder, which the environment variable names.
+def check_private(path: Path, variable: str) -> None:
+    """Checks that nobody else can write into a folder or a file, whose folder the environment variable names.
 
     Raises:
-        PermissionError: the folder belongs to another user, or others may write into it.
+        PermissionError: it belongs to another user, or others may write into it.
     """
     if os.name != "posix":
         return
-    status = folder.stat()
+    status = path.stat()
     if status.st_uid != os.geteuid():
-        raise PermissionError(f"{folder} belongs to another user; set {variable} to a folder of your own")
+        raise PermissionError(f"{path} belongs to another user; set {variable} to a folder of your own")
     if status.st_mode & _WRITABLE_BY_OTHERS:
-        raise PermissionError(f'others may write into {folder}; run "chmod go-w" on it')
+        raise PermissionError(f'others may write into {path}; run "chmod go-w" on it')
 
 
 def _build(compiler: str, source: str, path: Path, flags: tuple[str, ...]) -> None:
@@ -135,12 +135,10 @@ def _is_whole(path: Path) -> bool:
     A folder that others could once write into may still hold their files. These are built again.
     """
     try:
-        status = path.lstat()
-    except FileNotFoundError:
-        return False
-    if not stat.S_ISREG(status.st_mode):
-        return False
-    if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & _WRITABLE_BY_OTHERS):
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return False
+        check_private(path, "BALLBOT_CACHE")
+    except (FileNotFoundError, PermissionError):
         return False
     content = path.read_bytes()
     return hashlib.sha256(content[:-_DIGEST]).digest() == content[-_DIGEST:]

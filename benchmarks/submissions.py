@@ -42,7 +42,8 @@ def make(folder: Path) -> list[Path]:
     for i, (task, controller, physics, robot) in enumerate(HONEST):
         out = folder / str(i)
         evaluate(controller, task, episodes=EPISODES, physics=physics, robot=robot, out=out)
-        paths += submissions.submit(out, controller, "", out)
+        packed = submissions.pack(out, controller, "")
+        paths += [files.write(out / file, content) for file, content in packed.items()]
     return paths
 
 

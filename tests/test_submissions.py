@@ -18,14 +18,19 @@ from ballbot_train.evaluation.steering import costates
 from ballbot_train.evaluation.submissions import (
     SubmissionError,
     copies,
+    pack,
     read_entries,
-    submit,
     summary,
     too_good,
     verify,
 )
 
 EPISODES = 2
+
+
+def submit(results, name, link, out, controller=""):
+    """Writes what would be submitted without verifying it, because it has fewer episodes than a submission."""
+    return [files.write(out / file, content) for file, content in pack(results, name, link, controller).items()]
 
 
 @pytest.fixture(scope="module")

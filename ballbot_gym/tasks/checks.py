@@ -26,7 +26,7 @@ def check_methods(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarra
             f"{kind}.sample is never called by environments; delete it, and draw an episode from the numbers z in "
             "draw_constants and draw_state"
         )
-    again = task.start(*_zeros(task, c), params), task.start(*_zeros(task, c), params)
+    again = task.start(*_draws(task, c), params), task.start(*_draws(task, c), params)
     if again[0] != again[1]:
         raise ValueError(f"{kind}.draw_state gives other states for the same z and c; draw from z alone")
     if (n := len(task.margins(x, begin))) != len(task.margin_names):
@@ -76,6 +76,6 @@ def _number(value: Any) -> float | None:
     return float(array) if array.shape == () and array.dtype.kind in "iuf" else None
 
 
-def _zeros(task: Task, c: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Uniform numbers for `Task.start`, and the constants."""
+def _draws(task: Task, c: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The same uniform numbers for `Task.start`, and the constants."""
     return (0.5,) * task.state_draws, tuple(np.asarray(c, np.float64).tolist())

@@ -111,6 +111,7 @@ def _registered(options: list[str]) -> list[str]:
     this folder too, a path after --robot is registered under its file's name, and other names become ours: the id of a task,
     and "pybullet".
     """
+    from ballbot_gym.engines import PHYSICS_ALIASES
     from ballbot_gym.robots import register_robot, short_name
 
     named = []
@@ -129,8 +130,8 @@ def _registered(options: list[str]) -> list[str]:
             from ballbot_gym.tasks import TASKS
 
             word = next((name for name, kind in TASKS.items() if kind.id == word), word)
-        elif word == "pybullet" and "--out" not in (flag, *named[-1:]):
-            word = "bullet"
+        elif word in PHYSICS_ALIASES and "--out" not in (flag, *named[-1:]):
+            word = PHYSICS_ALIASES[word]
         named.append(f"{flag}{equals}{word}")
     return named
 

@@ -1,12 +1,12 @@
 """Names of controllers in tables and in file names: unique, whatever names and paths users give."""
 
-import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
 from ballbot_gym.engines import PHYSICS
+from ballbot_gym.identity import digest
 from ballbot_gym.robots import ROBOTS
 
 _PLAIN = re.compile("[a-z0-9]+(-[a-z0-9]+)*")
@@ -32,8 +32,7 @@ def file_part(name: str) -> str:
         return name
     path = Path(name)
     readable = re.sub("[^a-z0-9]+", "-", f"{path.parent.name}-{path.stem}".lower()).strip("-")[:_LONGEST]
-    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:_DIGEST]
-    return f"{readable}-{digest}".strip("-")
+    return f"{readable}-{digest(name)[:_DIGEST]}".strip("-")
 
 
 def shortened(names: Iterable[str]) -> dict[str, str]:

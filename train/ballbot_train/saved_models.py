@@ -156,9 +156,8 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
 
 def _size(model: Saved, task: Task, params: BallbotParams) -> int:
     """Numbers that an env shows to a model, with the history that the model was trained with."""
-    history = history_of(model, task, params)
-    own = task.observation_size(params)
-    return own + history * (own + params.action_size)
+    (size,) = observation_space(task, params, history_of(model, task, params)).shape
+    return size
 
 
 def read(path: str | Path) -> Saved:

@@ -21,9 +21,8 @@ from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import (
     HEADER,
     TABLE,
-    cells,
     leaderboard,
-    with_short_names,
+    table_cells,
     write_leaderboard,
     write_results,
 )
@@ -93,7 +92,7 @@ def benchmark(
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    report = report_page(title, replays, HEADER, [cells(row) for row in with_short_names(rows)], shown, facts)
+    report = report_page(title, replays, HEADER, table_cells(TABLE, rows), shown, facts)
     page = files.write(out / "report.html", report)
     publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows)
     for result in done:

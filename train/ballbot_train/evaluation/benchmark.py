@@ -13,7 +13,7 @@ import numpy as np
 from ballbot_gym import certified, files
 from ballbot_gym.certified import version
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.identity import problem_digest
+from ballbot_gym.identity import named_problem_digest
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
@@ -24,7 +24,7 @@ from ballbot_train.console import check_least, check_names, check_some, markdown
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import as_controller, run_episodes, shown_to
-from ballbot_train.evaluation.results import Result, columns, with_short_names
+from ballbot_train.evaluation.results import Result, columns, table_cells
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import shipped_ways
 from ballbot_train.provenance import provenance
@@ -115,7 +115,7 @@ def open_run(
         for name, digest in policy_digests(by_task, made_for).items()
     }
     problems = {
-        task if name == robot else f"{name}/{task}": problem_digest(make_task(task, name), named_robot(name))
+        task if name == robot else f"{name}/{task}": named_problem_digest(task, name)
         for made_for, by_task in chosen.items()
         for task in by_task
         for name in (robot, made_for)
@@ -127,12 +127,8 @@ def open_run(
             about = files.read_json(path).get("about")
             held = {key: value for key, value in about.items() if key in settings} if isinstance(about, dict) else {}
             jobs.check_same(held, settings, out, "results")
-    facts = (
-        {"benchmark": version.BENCHMARK}
-        | provenance()
-        | settings
-        | {"workers": Workers.of(workers).here or "a Ray cluster"}
-    )
+    facts = {"benchmark": version.BENCHMARK} | provenance() | settings
+    facts["workers"] = Workers.of(workers).here or "a Ray cluster"
     ways = {name: shipped_ways()[found] for name, found in policies.items() if found in shipped_ways()}
     facts |= {"trained_by": ways} if ways else {}
     jobs.claim(out, {key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
@@ -141,7 +137,7 @@ def open_run(
 
 def publish(out: Path, name: str, title: str, shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any]) -> None:
     """Ends a run: writes its table as NAME.md, and prints it. It has what is `shown` of each row, by header."""
-    header, table = list(shown), [[text(row) for text in shown.values()] for row in with_short_names(rows)]
+    header, table = list(shown), table_cells(shown, rows)
     files.write(out / f"{name}.md", markdown(header, table))
     jobs.release(out)
     print_table(title, header, table)

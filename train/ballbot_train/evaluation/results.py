@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -250,7 +250,12 @@ def cells(row: Row) -> list[str]:
     return [text(row) for text in TABLE.values()]
 
 
-def with_short_names(rows: Sequence[Any]) -> list[Any]:
-    """Rows as tables show them: of the path of a policy's file the shortest end that tells it from the others."""
-    short = shortened(row.controller for row in rows if hasattr(row, "controller"))
-    return [replace(row, controller=short[row.controller]) if hasattr(row, "controller") else row for row in rows]
+def table_cells(shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any]) -> list[list[str]]:
+    """Rows as text, under the headers of what is `shown` of each. Paths of policies are as short as tells them apart."""
+    table = [[text(row) for text in shown.values()] for row in rows]
+    if "controller" in shown:
+        place = list(shown).index("controller")
+        short = shortened(line[place] for line in table)
+        for line in table:
+            line[place] = short[line[place]]
+    return table

@@ -118,7 +118,7 @@ class Entry:
                 f"{path} is the row of another submission of this name; submit under another --name, or delete that row "
                 "first if it is yours"
             )
-        return files.write(folder / self.file, to_json(asdict(self)))
+        return files.write(path, to_json(asdict(self)))
 
 
 def read_entries(folder: Path = LEADERBOARD) -> list[Entry]:
@@ -175,26 +175,19 @@ def read_run(source: Path) -> tuple[dict[str, Any], list[Result]]:
     return {"policies": policies}, [result for entry in chosen for result in entry.results()]
 
 
-def submit(results: Path, name: str, link: str, out: Path, controller: str = "") -> list[Path]:
-    """Writes the submissions of a results folder, one file per task and robot.
+def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str, bytes]:
+    """The submissions of a results folder, one for each task and robot: their content by the names of their files.
 
     Args:
         results: folder of `evaluate(out=...)`, `ballbot evaluate` or `ballbot benchmark`.
         name: of the rows.
         link: where one reads about the controller; http or https, or "".
-        out: folder of the submissions.
         controller: which one, where the folder has several.
 
     Raises:
         SubmissionError: what a recording says about itself is wrong.
         ValueError: there is no recording in it, or one of several controllers.
     """
-    packed = pack(results, name, link, controller)
-    return [files.write(out / file, content) for file, content in packed.items()]
-
-
-def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str, bytes]:
-    """The submissions that `submit` writes, by file name. Arguments and errors are those of `submit`."""
     paths = sorted((results / recordings.FOLDER).glob("*.npz"))
     found = [(path, recordings.read(path)) for path in paths]
     names = list(dict.fromkeys(str(recording.about.get("controller")) for _, recording in found))

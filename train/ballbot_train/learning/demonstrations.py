@@ -43,9 +43,9 @@ from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.identity import problem_digest
+from ballbot_gym.identity import named_problem_digest
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs, shards
@@ -221,13 +221,12 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
         parse_dataset_id(out.name)
     except (ValueError, TypeError):
         raise ValueError(f"a dataset's folder is named NAME-vNUMBER, as stabilize-trajopt-v0, not {out.name}") from None
-    described = asdict(config) | {"problem": _problem(config)}
+    described = asdict(config) | {"problem": named_problem_digest(config.task, config.robot)}
     unfinished = out.with_name(f".{out.name}.unfinished")
     if out.exists():
         metadata = metadata_of(out)
-        held = metadata["demos"] | {
-            "problem": metadata.get("problem", described["problem"])
-        }  # older ones have no digest
+        # older ones have no digest
+        held = metadata["demos"] | {"problem": metadata.get("problem", described["problem"])}
         jobs.check_same(held, described, out, "a dataset")
         shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
         return out
@@ -267,15 +266,10 @@ def write_shards(
         "demos": described,
         "task": repr(make_task(config.task, config.robot)),
         "observation_version": OBSERVATION_VERSION,
-        "problem": _problem(config),
+        "problem": named_problem_digest(config.task, config.robot),
     }
     named = f"{config.task} {config.expert}"
     return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, named, per_shard)
-
-
-def _problem(config: DemoConfig) -> str:
-    """Digest of the task and the robot that a dataset shows."""
-    return problem_digest(make_task(config.task, config.robot), named_robot(config.robot))
 
 
 def _recorded(config: DemoConfig, episodes: Sequence[int]) -> dict[str, np.ndarray]:
@@ -339,7 +333,7 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
             "task": repr(task),
             "observation_version": OBSERVATION_VERSION,
             "demos": asdict(config),
-            "problem": _problem(config),
+            "problem": named_problem_digest(config.task, config.robot),
         }
     )
     (root / out.name).rename(out)

@@ -35,7 +35,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import problem_digest
+from ballbot_gym.identity import named_problem_digest
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
@@ -132,8 +132,7 @@ def run(
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
     workers = Workers.of(workers)  # refused before anything is written
-    problem = problem_digest(make_task(search.task, search.robot), named_robot(search.robot))
-    jobs.claim(out, asdict(search) | {"problem": problem}, "config.json")
+    jobs.claim(out, asdict(search) | {"problem": named_problem_digest(search.task, search.robot)}, "config.json")
     try:
         study = open_study(search, out)
         ended = _State.COMPLETE, _State.PRUNED

@@ -19,6 +19,7 @@ from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.benchmark import floor
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.results import Result
+from ballbot_train.names import shortened
 from ballbot_train.report import labels
 
 LEAST_SLIP = 0.02
@@ -156,11 +157,10 @@ def file_replay(paths: Sequence[Path]) -> Replay:
     Raises:
         TrajectoryError: a file is missing or holds no trajectory.
     """
-    takes = []
+    takes, names = [], shortened(map(str, paths))
     for i, path in enumerate(paths):
         trajectory = playable(Trajectory.load(path), str(path))
-        alone = sum(other.stem == path.stem for other in paths) == 1
-        label = path.stem if alone else f"{path.parent.name}/{path.stem}"
+        label = names[str(path)].removesuffix(path.suffix)
         takes.append(Take(label, trajectory, labels.color(path.stem, i)))
     return Replay(", ".join(take.label for take in takes), tuple(takes))
 
