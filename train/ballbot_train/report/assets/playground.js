@@ -137,7 +137,7 @@ class Playground extends Player {
     Object.assign(link, { className: "link", href: this.link, target: "_blank", textContent: "Link to this drive" });
     const who = this.given ? "The driver" : "You";
     const sentence = shares[0] ? `${who} ${did}: ${shares[0]}${rival}.` : `${who} ${did}.`;
-    this.find("text").replaceChildren(`${sentence} Who opens the link sees the drive: `, link);
+    this.find("text").replaceChildren(`${sentence} Anyone who opens this link sees the drive: `, link);
   }
 
   /** A push for everyone. Where somebody has fallen, all start again first. */
