@@ -5,18 +5,21 @@ episodes, rounded to nine digits so that machines agree. A comment or a rewritte
 """
 
 import hashlib
+import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 
-_PROBES = 8  # states and episodes at which a task is compared
+_PROBES = 8  # episodes at which a task is compared
+_SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)  # m, rad and per second, of states at which it is compared
+_TIMES = (0.0, 0.5, 2.0, 5.0, 7.9)  # s
 _DIGITS = 9
 
 
@@ -31,18 +34,24 @@ def robot_digest(params: BallbotParams) -> str:
     return digest(repr(params))
 
 
+@np.errstate(all="ignore")  # far from every episode a task need not give numbers
 def observation_digest(task: Task, params: BallbotParams) -> str:
-    """Digest of the observations of a task at fixed states and constants.
+    """Digest of the observations of a task at fixed states and times, and at constants.
 
-    These are not drawn by the task, so that robots with other episodes share a digest where they observe the same.
+    Of the constants, some are fixed numbers, and some are drawn as the task draws them by default for a shipped robot. So
+    robots and tasks with other episodes share a digest where they observe the same.
     """
-    rng, digits = np.random.default_rng(2), []
-    for _ in range(_PROBES):
-        x, c = rng.uniform(0.1, 0.9, params.state_size), rng.uniform(1.0, 2.0, len(task.constant_names))
-        digits.append(_rounded(task.seen(x, np.asarray(task.at(c, 0.5)))))
+    rng, names, usual = np.random.default_rng(2), len(task.constant_names), _with_default_fields(task)
+    robot = named_robot(PAPER if params.wheels is None else "omni")
+    digits = []
+    for x, time in _anywhere(rng, params):
+        drawn = usual.draw_constants(tuple(rng.random(task.constant_draws).tolist()), robot)
+        for c in (rng.uniform(1.0, 2.0, names), np.array(drawn, np.float64)):
+            digits.append(_rounded(task.seen(x, np.asarray(task.at(c, time)))))
     return digest(digits)
 
 
+@np.errstate(all="ignore")
 def problem_digest(task: Task, params: BallbotParams) -> str:
     """Digest of a robot and of a task's episodes, costs, limits, goal and observations.
 
@@ -63,15 +72,30 @@ def named_problem_digest(task: str, robot: str) -> str:
     return problem_digest(make_task(task, robot), named_robot(robot))
 
 
-def _probes(task: Task, params: BallbotParams) -> Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Fixed states, forces, and constants as `Task.at` gives them: those of drawn episodes, moved by some tenths."""
+def _probes(task: Task, params: BallbotParams) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Fixed states, forces, and constants as `Task.at` gives them: of drawn episodes, near their starts and anywhere."""
     rng = np.random.default_rng(1)
-    for _ in range(_PROBES):
-        x, c = task.sample(rng, params)
-        x = x + rng.uniform(-0.3, 0.3, x.shape)
-        u = params.force_limit * rng.uniform(-1, 1, params.action_size)
-        yield x, u, np.asarray(task.at(c, 0.5))
+    starts = [task.sample(rng, params) for _ in range(_PROBES)]
+    near = [(x + rng.uniform(-0.3, 0.3, x.shape), c, 0.5) for x, c in starts]
+    anywhere = [(x, task.sample(rng, params)[1], time) for x, time in _anywhere(rng, params)]
+    for x, c, time in (*near, *anywhere):
+        yield x, params.force_limit * rng.uniform(-1, 1, params.action_size), np.asarray(task.at(c, time))
+
+
+def _anywhere(rng: np.random.Generator, params: BallbotParams) -> Iterator[tuple[np.ndarray, float]]:
+    """States with components of both signs, near zero and far from it, each with a time, s."""
+    for scale, time in itertools.product(_SCALES, _TIMES):
+        yield rng.uniform(-scale, scale, params.state_size), time
+
+
+def _with_default_fields(task: Task) -> Task:
+    """A task of the same kind with default fields."""
+    try:
+        return type(task)()
+    except TypeError:  # a field of a user's task has no default
+        return task
 
 
 def _rounded(values: Any) -> list[str]:
-    return [f"{value:.{_DIGITS}g}" for value in np.ravel(np.asarray(values, np.float64)).tolist()]
+    """Numbers as text. Negative zeros, which rounding makes of different signs on other machines, are zeros."""
+    return [f"{value + 0.0:.{_DIGITS}g}" for value in np.ravel(np.asarray(values, np.float64)).tolist()]
