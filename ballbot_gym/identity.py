@@ -7,7 +7,7 @@ episodes, rounded to nine digits so that machines agree. A comment or a rewritte
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,11 +29,6 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def robot_digest(params: BallbotParams) -> str:
-    """Digest of all numbers of a robot."""
-    return digest(repr(params))
-
-
 @np.errstate(all="ignore")  # far from every episode a task need not give numbers
 def observation_digest(task: Task, params: BallbotParams) -> str:
     """Digest of the observations of a task at fixed states and times, and at constants.
@@ -51,25 +46,45 @@ def observation_digest(task: Task, params: BallbotParams) -> str:
     return digest(digits)
 
 
+PARTS = ("robot", "fields", "episodes", "costs", "limits", "goal", "observations")
+"""Of a problem, each with a digest of its own. A part may change those behind it too."""
+
+
 @np.errstate(all="ignore")
-def problem_digest(task: Task, params: BallbotParams) -> str:
-    """Digest of a robot and of a task's episodes, costs, limits, goal and observations.
+def problem_parts(task: Task, params: BallbotParams) -> dict[str, str]:
+    """Digests of a robot, and of a task's fields, episodes, costs, limits, goal and observations, by `PARTS`.
 
     Two tasks that share a name and differ in a cost have different digests, and so have two robots of one name.
     """
-    values = [
-        [_rounded([task.cost(x, u, c), *task.limits(x, c), *task.goal(x, c), *np.ravel(task.seen(x, c))])]
-        for x, u, c in _probes(task, params)
-    ]
-    rng = np.random.default_rng(0)
-    episodes = [[_rounded(part) for part in task.sample(rng, params)] for _ in range(_PROBES)]
-    fields = [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit]
-    return digest(fields, robot_digest(params), values, episodes)
+    probes, rng = list(_probes(task, params)), np.random.default_rng(0)
+    values = (
+        [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit],
+        [[_rounded(part) for part in task.sample(rng, params)] for _ in range(_PROBES)],
+        [_rounded(task.cost(x, u, c)) for x, u, c in probes],
+        [_rounded(task.limits(x, c)) for x, _, c in probes],
+        [_rounded(task.goal(x, c)) for x, _, c in probes],
+        [_rounded(task.seen(x, c)) for x, _, c in probes],
+    )
+    return {name: digest(part) for name, part in zip(PARTS, (repr(params), *values), strict=True)}
 
 
-def named_problem_digest(task: str, robot: str) -> str:
-    """`problem_digest` of a task and a robot by name."""
-    return problem_digest(make_task(task, robot), named_robot(robot))
+def problem_digest(task: Task, params: BallbotParams) -> str:
+    """One digest of all parts of a problem."""
+    return digest(problem_parts(task, params))
+
+
+def named_problem(task: str, robot: str) -> dict[str, str]:
+    """`problem_parts` of a task and a robot by name."""
+    return problem_parts(make_task(task, robot), named_robot(robot))
+
+
+def changed_parts(held: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
+    """Names of the parts of a problem that differ. Those that may follow from a changed robot, or from changed episodes, are
+    not named.
+    """
+    changed = [name for name in PARTS if held.get(name) != wanted.get(name)]
+    first = next((name for name in ("robot", "episodes") if name in changed), None)
+    return changed if first is None else [name for name in changed if name in (first, "fields")]
 
 
 def _probes(task: Task, params: BallbotParams) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
