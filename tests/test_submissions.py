@@ -354,6 +354,17 @@ def test_a_refused_submission_replaces_and_removes_nothing(submitted, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_another_submission_of_the_same_name_is_not_overwritten(submitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(submissions, "verify", lambda path, content=None: verify(path, EPISODES, content))
+    folder, out = submitted()[0], tmp_path / "out"
+    submit_command(folder, name="mine", out=out)
+    before = (out / "turn-mine-rk4.npz").read_bytes()
+    submit_command(folder, name="mine", out=out)
+    with pytest.raises(SubmissionError, match="is another submission of this name"):
+        submit_command(folder, name="mine", link="https://example.org/other", out=out)
+    assert (out / "turn-mine-rk4.npz").read_bytes() == before
+
+
 def test_a_row_says_whose_motion_it_is(submitted, tmp_path):
     entry = verify(submitted()[1], EPISODES)
     assert entry.optima == 0

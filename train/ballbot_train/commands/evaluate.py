@@ -58,7 +58,7 @@ def evaluate(
     check_least(0, optima=optima)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
-    named = f"{task}-{file_part(policy)}" + (f"-on-{randomization}" if randomization else "")
+    named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
