@@ -7,7 +7,7 @@ episodes, rounded to nine digits so that machines agree. A comment or a rewritte
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ def observation_digest(task: Task, params: BallbotParams) -> str:
     for x, time in _anywhere(rng, params):
         drawn = usual.draw_constants(tuple(rng.random(task.constant_draws).tolist()), robot)
         for c in (rng.uniform(1.0, 2.0, names), np.array(drawn, np.float64)):
-            digits.append(_rounded(task.seen(x, np.asarray(task.at(c, time)))))
+            digits.append(_rounded(task.seen, x, np.asarray(task.at(c, time))))
     return digest(digits)
 
 
@@ -59,11 +59,9 @@ def problem_parts(task: Task, params: BallbotParams) -> dict[str, str]:
     probes, rng = list(_probes(task, params)), np.random.default_rng(0)
     values = (
         [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit],
-        [[_rounded(part) for part in task.sample(rng, params)] for _ in range(_PROBES)],
-        [_rounded(task.cost(x, u, c)) for x, u, c in probes],
-        [_rounded(task.limits(x, c)) for x, _, c in probes],
-        [_rounded(task.goal(x, c)) for x, _, c in probes],
-        [_rounded(task.seen(x, c)) for x, _, c in probes],
+        [[_digits(part) for part in task.sample(rng, params)] for _ in range(_PROBES)],
+        [_rounded(task.cost, *probe) for probe in probes],
+        *([_rounded(of, x, c) for x, _, c in probes] for of in (task.limits, task.goal, task.seen)),
     )
     return {name: digest(part) for name, part in zip(PARTS, (repr(params), *values), strict=True)}
 
@@ -111,6 +109,14 @@ def _with_default_fields(task: Task) -> Task:
         return task
 
 
-def _rounded(values: Any) -> list[str]:
+def _rounded(method: Callable[..., Any], *where: np.ndarray) -> list[str]:
+    """What a method of a task gives there, as text; or the error by which it refuses a state that no episode reaches."""
+    try:
+        return _digits(method(*where))
+    except Exception as error:  # of a user's code
+        return [type(error).__name__]
+
+
+def _digits(values: Any) -> list[str]:
     """Numbers as text. Negative zeros, which rounding makes of different signs on other machines, are zeros."""
     return [f"{value + 0.0:.{_DIGITS}g}" for value in np.ravel(np.asarray(values, np.float64)).tolist()]

@@ -110,6 +110,24 @@ def test_problems_differ_that_differ_only_for_some_constants_or_times() -> None:
     assert problem_digest(LateTurn(), PAPER) != problem_digest(EarlyTurn(), PAPER)
 
 
+class Picky(Stabilize):
+    """Refuses to observe what is far from its episodes."""
+
+    def observe(self, x, c):
+        if abs(float(x[0])) > 5:
+            raise ValueError("nobody has been there")
+        return super().observe(x, c)
+
+
+def test_a_task_may_refuse_states_that_no_episode_reaches() -> None:
+    assert (
+        observation_digest(Picky(), PAPER)
+        == observation_digest(Picky(), PAPER)
+        != observation_digest(Stabilize(), PAPER)
+    )
+    assert problem_digest(Picky(), PAPER) == problem_digest(Picky(), PAPER)
+
+
 def test_a_policy_of_an_earlier_version_is_read_by_name_and_size(tmp_path: Path) -> None:
     path = save_policy(tmp_path / "policy", PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))), {})
     document = json.loads(path.read_text())
