@@ -29,9 +29,9 @@ pytest: $(VENV)/installed
 test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
 
-# the submissions that lie beside rows of the leaderboard
+# the submissions that lie beside rows of the leaderboard; with RECORDINGS=FOLDER also those of releases, downloaded there
 verify: $(VENV)/installed
-	$(BIN)/pytest tests/test_submissions.py -k "beside or row"
+	BALLBOT_RECORDINGS=$(RECORDINGS) $(BIN)/pytest tests/test_submissions.py -k "beside or row"
 
 # one page with all figures of speed, beside those of the last page of another commit
 bench: $(VENV)/installed

@@ -8,6 +8,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_train import policy_files
 from ballbot_train.console import check_names
 from ballbot_train.policy_files import is_run, read_description, shipped_policies, weights_digest
 
@@ -95,6 +96,12 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
         return ""
     robot, name = robot if isinstance(robot, str) else robot_name(robot), plain(name)
     return weights_digest(shipped_policies(task, robot, None).get(name, name))
+
+
+def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
+    """Digest of the network of a policy by name or file, as its description says; see `policy_files.network_digest`."""
+    name = plain(name)
+    return policy_files.network_digest(shipped_policies(task, robot, None).get(name, name))
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
