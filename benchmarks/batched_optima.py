@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_baselines.batched import find_optima
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optima, find_optimum
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params

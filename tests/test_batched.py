@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines import batched
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum import batched
 from ballbot_gym import certified, dynamics, machine_code, ops
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit

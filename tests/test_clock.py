@@ -5,11 +5,8 @@ import pytest
 import torch
 from test_examples import load
 
-from ballbot_baselines import find_optimum, regret
-from ballbot_baselines.batched import solves
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optimum, regret
+from ballbot_baselines.optimum.batched import solves
 from ballbot_gym import BallbotEnv, step_code
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.native import BallbotNative

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from ballbot_baselines import batched, find_optimum
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum import batched
 from ballbot_gym import ops
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.stabilize import Stabilize

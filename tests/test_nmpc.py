@@ -5,8 +5,8 @@ pytest.importorskip("casadi")
 
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
-from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.horizon import HorizonQp
+from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
+from ballbot_baselines.feedback.horizon import HorizonQp
 from ballbot_gym import certified, dynamics
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import rollout, simulate

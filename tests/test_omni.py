@@ -8,8 +8,8 @@ import casadi
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import TrajoptController
+from ballbot_baselines.feedback.lqr import discrete_lqr
 from ballbot_gym import dynamics, omni
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
@@ -301,7 +301,7 @@ def test_a_free_heading_costs_nothing(robot):
 
 
 def test_what_knows_no_wheels_says_so(robot):
-    from ballbot_baselines import batched
+    from ballbot_baselines.optimum import batched
 
     task = make_task("stabilize", "omni")
     assert not batched.solves(task, robot)

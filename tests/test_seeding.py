@@ -7,7 +7,7 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from ballbot_baselines import batched
+from ballbot_baselines.optimum import batched
 from ballbot_gym import seeding
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_baselines import batched
-from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.trajopt import EXECUTED
-from ballbot_baselines.tvlqr import tube_gains
+from ballbot_baselines import Backoff, find_optimum
+from ballbot_baselines.feedback.trajopt import EXECUTED
+from ballbot_baselines.feedback.tvlqr import tube_gains
+from ballbot_baselines.optimum import batched
 from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes

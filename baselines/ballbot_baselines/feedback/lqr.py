@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
+from ballbot_baselines.solvers.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
 from ballbot_gym import dynamics, omni
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError

@@ -25,12 +25,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.horizon import grid, horizon_qp
-from ballbot_baselines.linearize import quadratic_cost
-from ballbot_baselines.optimum import Optimum, plan_to_track
-from ballbot_baselines.shooting import Backoff, RobotKind
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
+from ballbot_baselines.feedback.horizon import grid, horizon_qp
+from ballbot_baselines.feedback.tvlqr import TvlqrController
+from ballbot_baselines.optimum.find import Optimum, plan_to_track
+from ballbot_baselines.solvers.linearize import quadratic_cost
+from ballbot_baselines.solvers.shooting import Backoff, RobotKind
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError

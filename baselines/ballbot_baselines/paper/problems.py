@@ -12,10 +12,10 @@ from functools import partial
 import numpy as np
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.collocation import Guess, Plan, Problem, solve
-from ballbot_baselines.guess import along_path
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.feedback.lqr import discrete_lqr
+from ballbot_baselines.feedback.tvlqr import TvlqrController
+from ballbot_baselines.paper.collocation import Guess, Plan, Problem, solve
+from ballbot_baselines.solvers.guess import along_path
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared

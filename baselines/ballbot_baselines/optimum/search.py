@@ -10,9 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines import guess, righting, sides
-from ballbot_baselines.ocp import OcpSolution
-from ballbot_baselines.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
+from ballbot_baselines.optimum import sides
+from ballbot_baselines.solvers import guess, righting
+from ballbot_baselines.solvers.ocp import OcpSolution
+from ballbot_baselines.solvers.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, sides_passed, then_stay

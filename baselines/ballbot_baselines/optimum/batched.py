@@ -22,9 +22,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ballbot_baselines import guess, righting, search, sides
-from ballbot_baselines.ilqr import MARGIN, Guesses, Options, Rows, Solutions, ilqr
-from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
+from ballbot_baselines.optimum import search, sides
+from ballbot_baselines.solvers import guess, righting
+from ballbot_baselines.solvers.ilqr import MARGIN, Guesses, Options, Rows, Solutions, ilqr
+from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import sides_passed

@@ -13,10 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from ballbot_baselines import batched
-from ballbot_baselines.ocp import OcpSolution
-from ballbot_baselines.search import ALL_GUESSES, attempts
-from ballbot_baselines.shooting import Backoff, Shooting
+from ballbot_baselines.optimum import batched
+from ballbot_baselines.optimum.search import ALL_GUESSES, attempts
+from ballbot_baselines.solvers.ocp import OcpSolution
+from ballbot_baselines.solvers.shooting import Backoff, Shooting
 from ballbot_gym.checks import finite_array
 from ballbot_gym.display import Moving
 from ballbot_gym.env import make_task

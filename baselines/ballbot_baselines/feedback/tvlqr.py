@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ballbot_baselines.lqr import Gains, lqr_at_end, tracking_gains
+from ballbot_baselines.feedback.lqr import Gains, lqr_at_end, tracking_gains
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory

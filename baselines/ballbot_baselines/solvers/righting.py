@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import guess
+from ballbot_baselines.solvers import guess
 from ballbot_gym import dynamics, omni, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams

@@ -21,7 +21,7 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import ACCEPTABLE, Ocp, OcpSolution, OcpSolver, no_path
+from ballbot_baselines.solvers.ocp import ACCEPTABLE, Ocp, OcpSolution, OcpSolver, no_path
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError

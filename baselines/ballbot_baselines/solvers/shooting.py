@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
-from ballbot_baselines import guess
-from ballbot_baselines.formulas import check_formulas
-from ballbot_baselines.ocp import Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.solvers import guess
+from ballbot_baselines.solvers.formulas import check_formulas
+from ballbot_baselines.solvers.ocp import Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number

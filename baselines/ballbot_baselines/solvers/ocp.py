@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LONG, SIMD
-from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp, Stages
+from ballbot_baselines.solvers.compiled import LONG, SIMD
+from ballbot_baselines.solvers.nlp import RatesStage, Stage, StagedNlp, Stages
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]

@@ -18,9 +18,9 @@ from dataclasses import replace
 import casadi
 import numpy as np
 
-from ballbot_baselines import righting
-from ballbot_baselines.ocp import Ocp, OcpSolution, OcpSolver
-from ballbot_baselines.shooting import Backoff, kind_of, ocp_of, shooting_parameters
+from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.ocp import Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.solvers.shooting import Backoff, kind_of, ocp_of, shooting_parameters
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 

@@ -9,9 +9,9 @@ from functools import lru_cache
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, LONG, SIMD, InPlace, in_lanes
-from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.shooting import RobotKind, robot_numbers
+from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
+from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
+from ballbot_baselines.solvers.shooting import RobotKind, robot_numbers
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import batched
-from ballbot_baselines.compiled import LANES
-from ballbot_baselines.optimum import Optimum, find_optimum
-from ballbot_baselines.search import COARSE
+from ballbot_baselines.optimum import batched
+from ballbot_baselines.optimum.find import Optimum, find_optimum
+from ballbot_baselines.optimum.search import COARSE
+from ballbot_baselines.solvers.compiled import LANES
 from ballbot_gym import dynamics
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
