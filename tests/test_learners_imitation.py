@@ -8,8 +8,8 @@ import torch
 from resuming import goes_on_as_if_never_stopped
 
 from ballbot_baselines import Backoff, TvlqrController, find_optimum
-from ballbot_baselines.feedback.tvlqr import tube_gains
 from ballbot_baselines.optimum import batched
+from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params

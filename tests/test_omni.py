@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ballbot_baselines import TrajoptController
-from ballbot_baselines.feedback.lqr import discrete_lqr
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics, omni
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator

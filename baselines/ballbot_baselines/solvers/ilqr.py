@@ -22,9 +22,9 @@ from typing import Any, NamedTuple, TypeVar, cast
 import casadi
 import numpy as np
 
-from ballbot_baselines.feedback.lqr import discrete_lqr, is_equilibrium
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.compiled import LANES, SIMD
+from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium
 from ballbot_baselines.solvers.shooting import RobotKind, kind_of, ocp_of
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams

@@ -7,8 +7,8 @@ the episode's cost rises per unit of the state. Costate times error is what an e
 
 import numpy as np
 
-from ballbot_baselines.feedback.lqr import lqr_at_end, tracking_gains
 from ballbot_baselines.solvers.linearize import cost_slopes, discretize
+from ballbot_baselines.solvers.riccati import lqr_at_end, tracking_gains
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 

@@ -23,8 +23,8 @@ import torch
 
 from ballbot_baselines import Backoff, find_optimum
 from ballbot_baselines.feedback.trajopt import EXECUTED
-from ballbot_baselines.feedback.tvlqr import tube_gains
 from ballbot_baselines.optimum import batched
+from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
