@@ -59,7 +59,8 @@ def measured(name: str, episodes: int, seed: int) -> Row:
                 print(f"{name}, episode {i}: {error}")
         seconds[0] += time.process_time() - begin
         begin = time.process_time()
-        costs[rows] = find_optima(task, params, x0[rows], c[rows]).costs
+        optima = find_optima(task, params, x0[rows], c[rows])
+        costs[rows] = [math.nan if optimum is None else optimum.cost for optimum in optima]
         seconds[1] += time.process_time() - begin
     excess = (costs / alone - 1)[np.isfinite(costs) & np.isfinite(alone)]
     return Row(

@@ -60,7 +60,7 @@ def test_the_costate_is_the_slope_of_the_optimal_cost(params):
     for i in (0, 6):
         unit = h * np.eye(8)[i]
         costs = [find_optimum(rest, params, optimum.trajectory.x[k] + s * unit, NO_CONSTANTS).cost for s in (1, -1)]
-        assert optimum.costates[k - 1, i] == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=1e-3, abs=1e-3)
+        assert optimum.slopes[k, i] == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=1e-3, abs=1e-3)
 
 
 class AtRest:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from ballbot_baselines.feedback.nmpc import NmpcController, offset_free_nmpc
     from ballbot_baselines.feedback.trajopt import TrajoptController
     from ballbot_baselines.feedback.tvlqr import TvlqrController
-    from ballbot_baselines.optimum.batched import find_optima
-    from ballbot_baselines.optimum.find import Optimum, find_optimum, plan_to_track
+    from ballbot_baselines.optimum.find import find_optima, find_optimum, plan_to_track
     from ballbot_baselines.optimum.measured import Regret, regret
+    from ballbot_baselines.optimum.optimum import Optimum
     from ballbot_baselines.solvers.guess import along_path
     from ballbot_baselines.solvers.shooting import Backoff
 
@@ -74,9 +74,9 @@ _MODULES = {
     "feedback.nmpc": ("NmpcController", "offset_free_nmpc"),
     "feedback.trajopt": ("TrajoptController",),
     "feedback.tvlqr": ("TvlqrController",),
-    "optimum.batched": ("find_optima",),
-    "optimum.find": ("Optimum", "find_optimum", "plan_to_track"),
+    "optimum.find": ("find_optima", "find_optimum", "plan_to_track"),
     "optimum.measured": ("Regret", "regret"),
+    "optimum.optimum": ("Optimum",),
     "solvers.guess": ("along_path",),
     "solvers.shooting": ("Backoff",),
 }

@@ -193,9 +193,10 @@ class HorizonQp:
         x, a, states = self.x, self.a, self._states
         self._stage()
         if self.disturbance is not None:
-            rates, slopes = self.disturbance.rates(self.x, self.a)
-            self._next += self.h[:, None] * rates
-            self._jacobian += self.h[:, None, None] * slopes
+            with np.errstate(all="ignore"):  # where the iteration diverges, this may overflow, and there is no solution
+                rates, slopes = self.disturbance.rates(self.x, self.a)
+                self._next += self.h[:, None] * rates
+                self._jacobian += self.h[:, None, None] * slopes
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from ballbot_baselines.feedback.tvlqr import TvlqrController
-from ballbot_baselines.optimum.find import Optimum, plan_to_track
+from ballbot_baselines.optimum.find import plan_to_track
+from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import TRACKS
