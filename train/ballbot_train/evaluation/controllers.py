@@ -174,7 +174,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ending = ending or "-adaptive"
     if not ending:
         return controller
-    from ballbot_baselines.adaptive import FilteredController  # it imports CasADi
+    from ballbot_baselines.feedback.adaptive import FilteredController  # it imports CasADi
 
     return FilteredController(task, params, ending, controller)
 

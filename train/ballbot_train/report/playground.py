@@ -17,7 +17,7 @@ import casadi
 import numpy as np
 from markupsafe import Markup
 
-from ballbot_baselines.lqr import LqrController
+from ballbot_baselines import LqrController
 from ballbot_gym import certified, drawing, dynamics, files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params

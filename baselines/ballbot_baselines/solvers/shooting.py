@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
-from ballbot_baselines import guess
-from ballbot_baselines.formulas import check_formulas
-from ballbot_baselines.ocp import Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.solvers import guess
+from ballbot_baselines.solvers.formulas import check_formulas
+from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
 from ballbot_gym import dynamics
 from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number
@@ -229,7 +229,7 @@ class Shooting:
         barrier: float = BARRIER,
         iterations: int = _MOST_ITERATIONS,
         tolerance: float | None = None,
-    ) -> OcpSolution:
+    ) -> Solution:
         """From a guess by one solver, which is made once for all robots of a kind.
 
         Args:
@@ -255,7 +255,7 @@ class Shooting:
         p = shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness, self.start)
         return made.solve(x, a, lower, upper, p)
 
-    def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[OcpSolution]:
+    def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[Solution]:
         """From a guess by fatrop, and if that fails by ipopt: all solutions, the best last.
 
         Args:
@@ -271,17 +271,17 @@ class Shooting:
                 break
         return solutions
 
-    def relaxed(self, x: np.ndarray, a: np.ndarray, h: float) -> OcpSolution:
+    def relaxed(self, x: np.ndarray, a: np.ndarray, h: float) -> Solution:
         """The solution with a free interval length from a guess with intervals of h s."""
         n, length = FREE_TIME_INTERVALS, h * len(a) / FREE_TIME_INTERVALS
-        x, a = _resampled(x, a, n)
+        x, a = guess.motion_resampled(x, a, n)
         for name in ("fatrop", "ipopt"):
             solution = self.solve(np.column_stack([x, np.full(n + 1, length)]), a, solver=name)
             if solution.is_optimal:
                 break
         return solution
 
-    def in_whole_steps(self, relaxed: OcpSolution) -> list[OcpSolution]:
+    def in_whole_steps(self, relaxed: Solution) -> list[Solution]:
         """Solutions that arrive after whole numbers of control steps.
 
         The search begins at the arrival of a solution with a free interval length, and goes both ways while the cost falls.
@@ -290,8 +290,10 @@ class Shooting:
         arrival = relaxed.states[0, -1] * FREE_TIME_INTERVALS / self.task.control_dt
         steps = min(max(1, math.ceil(arrival)), most)
 
-        def arriving(steps: int) -> list[OcpSolution]:
-            return self.solve_to_the_end(*_resampled(relaxed.states[:, :-1], relaxed.inputs, steps), near=True)
+        def arriving(steps: int) -> list[Solution]:
+            return self.solve_to_the_end(
+                *guess.motion_resampled(relaxed.states[:, :-1], relaxed.inputs, steps), near=True
+            )
 
         groups = {steps: arriving(steps)}
         for direction in (-1, 1):
@@ -303,8 +305,3 @@ class Shooting:
                     break
                 nearby += direction
         return [solution for group in groups.values() for solution in group]
-
-
-def _resampled(x: np.ndarray, a: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """States and actions of a guess at another number of equal steps."""
-    return guess.resampled(x, steps), guess.resampled(np.vstack([a, a[-1:]]), steps)[:-1]

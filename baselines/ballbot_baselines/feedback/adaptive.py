@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.kalman import SensorFilter, TrackFilter
-from ballbot_baselines.nmpc import BACKOFF, NmpcController
-from ballbot_baselines.shooting import Backoff
+from ballbot_baselines.feedback.kalman import SensorFilter, TrackFilter
+from ballbot_baselines.feedback.nmpc import BACKOFF, NmpcController
+from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.rollout import Controller, PlanError

@@ -18,9 +18,9 @@ from dataclasses import replace
 import casadi
 import numpy as np
 
-from ballbot_baselines import righting
-from ballbot_baselines.ocp import Ocp, OcpSolution, OcpSolver
-from ballbot_baselines.shooting import Backoff, kind_of, ocp_of, shooting_parameters
+from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
+from ballbot_baselines.solvers.shooting import Backoff, kind_of, ocp_of, shooting_parameters
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
@@ -69,9 +69,7 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
     return leans
 
 
-def _solve(
-    solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, value: float, p: list[float]
-) -> OcpSolution:
+def _solve(solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, value: float, p: list[float]) -> Solution:
     lower, upper = solver.ocp.no_bounds(len(a))
     known = [i for i in range(8) if i != _LEAN]
     lower[0, known] = upper[0, known] = np.where(np.array(known) == component, value, 0.0)

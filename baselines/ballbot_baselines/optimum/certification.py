@@ -6,14 +6,17 @@
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import batched
-from ballbot_baselines.compiled import LANES
-from ballbot_baselines.optimum import Optimum, find_optimum
-from ballbot_baselines.search import COARSE
+from ballbot_baselines.optimum import batched
+from ballbot_baselines.optimum.find import find_optimum
+from ballbot_baselines.optimum.guesses import COARSE
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.solvers.compiled import LANES
+from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym import dynamics
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
@@ -54,10 +57,10 @@ def entries(
     at_once = not randomization.moves_optima and batched.solves(task, params)  # else each has another robot
     while some := list(itertools.islice(left, AT_ONCE)):
         x0, c = (np.array(part) for part in zip(*(episode(task, params, index) for index in some), strict=True))
-        second = batched.find_optima(task, params, x0, c) if at_once else None
+        second = batched.search_many(task, params, x0, c, Backoff()) if at_once else None
         for k, index in enumerate(some):
             found: EvaluationSet | str = ""
-            twice = True if second is None else second.some(slice(k, k + 1))
+            twice = True if second is None else second[k] or False
             for start in itertools.islice(starts(task, params, index, randomization), redrawn):
                 try:
                     found = _solved(task, params, randomization, *start, twice)
@@ -74,7 +77,7 @@ def _solved(
     x0: np.ndarray,
     c: np.ndarray,
     drawn: tuple[float, ...],
-    twice: bool | batched.BatchOptima,
+    twice: bool | Optimum,
 ) -> EvaluationSet:
     """The set of one episode; raises a PlanError where no optimum is found."""
     optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn, twice)
@@ -93,7 +96,7 @@ def _solved(
     )
 
 
-def _optimal(*problem: Any, twice: bool | batched.BatchOptima = True, **options: Any) -> Optimum:
+def _optimal(*problem: Any, twice: bool | Optimum = True, **options: Any) -> Optimum:
     """What `find_optimum` finds in two searches; raises a PlanError for an episode that is merely feasible."""
     found = find_optimum(*problem, twice=twice, **options)
     if not found.is_optimal:
@@ -108,7 +111,7 @@ def optimum_of(
     c: np.ndarray,
     randomization: Randomization,
     drawn: tuple[float, ...],
-    twice: bool | batched.BatchOptima = True,
+    twice: bool | Optimum = True,
 ) -> Optimum:
     """The optimum of an episode for which a randomization drew this: of its own robot, and no force comes while it is late.
 
@@ -146,7 +149,18 @@ def optimum_of(
     found = _optimal(rest, params, states[-1], c, paths=paths, start=start)
     x = np.concatenate([states[:-1], found.trajectory.x])
     u = np.concatenate([np.zeros((delay, params.action_size)), found.trajectory.u])
-    return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))
+    return replace(
+        found,
+        cost=cost + found.cost,
+        trajectory=Trajectory(dt * np.arange(len(x)), x, u),
+        slopes=np.concatenate([np.full((delay, x.shape[1]), np.nan), found.slopes]),
+        feedback=partial(_delayed, found, delay),
+    )
+
+
+def _delayed(optimum: Optimum, steps: int) -> np.ndarray:
+    """Gains after control steps in which there is no feedback."""
+    return np.pad(optimum.gains, ((steps, 0), (0, 0), (0, 0)))
 
 
 def arrays(entries: Mapping[int, EvaluationSet | str], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LONG, SIMD
-from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp, Stages
+from ballbot_baselines.solvers.compiled import LONG, SIMD
+from ballbot_baselines.solvers.nlp import RatesStage, Stage, StagedNlp, Stages
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
@@ -96,13 +96,13 @@ class Ocp:
 
 
 @dataclass(frozen=True)
-class OcpSolution:
+class Solution:
     """What a solver returned. Look at `success` before anything else.
 
     `success` means that the solver met its tolerance; ipopt's "Solved_To_Acceptable_Level" does not. `states` is (N+1, ns)
     and `inputs` is (N, nw). `violation` is the largest amount by which a constraint or bound is missed, in the constraint's
-    unit. `costates` (N, ns) are the multipliers of the dynamics: row k is the
-    slope, with respect to s_{k+1}, of the optimal cost from stage k+1 on.
+    unit. Row k of `slopes` (N+1, ns) is the slope, with respect to s_k, of the optimal cost
+    from stage k on. It follows from the multipliers of the dynamics, and row 0 from those of the given initial state.
     """
 
     success: bool
@@ -113,7 +113,7 @@ class OcpSolution:
     violation: float
     iterations: int
     solver: str
-    costates: np.ndarray
+    slopes: np.ndarray
 
     @property
     def is_within_limits(self) -> bool:
@@ -183,7 +183,7 @@ class OcpSolver:
         lower: np.ndarray,
         upper: np.ndarray,
         p: np.ndarray | Sequence[float] = (),
-    ) -> OcpSolution:
+    ) -> Solution:
         """Solves from a guess.
 
         Args:
@@ -211,13 +211,14 @@ class OcpSolver:
         status = _status(self.solver, stats)
         z = np.array(result["x"]).ravel()
         g = np.array(self._g(z, p)).ravel()
-        violation = max(
-            np.max(np.maximum(self._g_lower - g, g - self._g_upper), initial=0.0),
-            np.max(np.maximum(lower - z, z - upper), initial=0.0),
-        )
+        with np.errstate(all="ignore"):  # an iterate that diverged may have overflown
+            violation = max(
+                np.max(np.maximum(self._g_lower - g, g - self._g_upper), initial=0.0),
+                np.max(np.maximum(lower - z, z - upper), initial=0.0),
+            )
         ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
         stages = z[: self.intervals * width].reshape(self.intervals, width)
-        return OcpSolution(
+        return Solution(
             success=bool(stats["success"] and status == SUCCEEDED and np.isfinite(z).all()),
             status=status,
             cost=float(result["f"]),
@@ -226,8 +227,8 @@ class OcpSolver:
             violation=float(violation),
             iterations=int(stats["iter_count"]),
             solver=self.solver,
-            # Gaps are s_{k+1} − next_k, and the cost's slope with respect to their right-hand side is minus the multiplier.
-            costates=-np.array(result["lam_g"]).ravel()[self._gaps],
+            # Gaps are s_{k+1} − next_k. Slopes with respect to bounds and right-hand sides are minus the multipliers.
+            slopes=-np.vstack([np.array(result["lam_x"])[:ns].T, np.array(result["lam_g"]).ravel()[self._gaps]]),
         )
 
 

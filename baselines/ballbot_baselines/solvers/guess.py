@@ -50,6 +50,12 @@ def resampled(values: np.ndarray, intervals: int) -> np.ndarray:
     return (values[..., after, :] - first) / length * (new - old[before])[:, None] + first
 
 
+def motion_resampled(x: np.ndarray, a: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States (..., n+1, k) and actions (..., n, m) of motions at another number of equal steps."""
+    held = np.concatenate([a, a[..., -1:, :]], axis=-2)
+    return resampled(x, steps), resampled(held, steps)[..., :-1, :]
+
+
 def _smoothed(values: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
     """Means (..., n, k) over `_SMOOTHING` seconds of values every dt s, one or (...,)."""
     widths = np.maximum(1, np.rint(_SMOOTHING / np.broadcast_to(dt, values.shape[:-2])).astype(int))

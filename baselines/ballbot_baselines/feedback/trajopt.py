@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, plan_to_track
-from ballbot_baselines.shooting import Backoff
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.feedback.tvlqr import TvlqrController
+from ballbot_baselines.optimum.find import plan_to_track
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.tasks import Task

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, SIMD, compiled, in_lanes
+from ballbot_baselines.solvers.compiled import LANES, SIMD, compiled, in_lanes
 
 
 class Stage:

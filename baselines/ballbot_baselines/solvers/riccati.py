@@ -4,18 +4,20 @@ All use the env's own discretization: force held for control_dt, cost summed ove
 cost of an endless episode is xᵀPx.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
-from ballbot_gym import dynamics, omni
+from ballbot_baselines.solvers.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
+from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Reference, Task
+from ballbot_gym.trajectory import Trajectory
 
 _MAX_ROUNDS = 50  # around a closed motion until the Riccati equation is periodic
+_ACTIVE = 0.05  # a goal function this close to the greatest one still limits the optimum
 _GOAL_PRICE = 10.0  # cost per squared goal tolerance, for references that do not end at an equilibrium
 
 
@@ -46,32 +48,6 @@ def discrete_lqr(
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 
 
-def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
-    """LQR in units of observations and actions, for tasks that end at rest in an equilibrium.
-
-    Returns:
-        The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
-        of such a task are the scaled errors of the state. With wheels all no observations count: (3, no) and (no, no). None
-        for every other task, and where LQR has no gain.
-    """
-    if task.clock:
-        return None
-    x, c = task.sample(np.random.default_rng(0), params)
-    reference = task.reference(x, c, params)
-    if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
-        return None
-    (x,), (u,) = omni.with_wheels(params, reference.x, reference.u)
-    try:
-        k, p = discrete_lqr(task, params, x, u, c)
-    except PlanError:
-        return None
-    of_observation = np.zeros((len(x), 8 if params.wheels is None else task.observation_size(params)))
-    of_observation[range(8), range(8)] = task.observation_scale[:8]
-    if params.wheels is not None:  # sin ψ, and the others as `Task.seen` scales them
-        of_observation[range(8, 11), range(-3, 0)] = 1.0, 5.0, 5.0
-    return -k @ of_observation / params.force_limit, of_observation.T @ p @ of_observation
-
-
 def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
     """Whether state x (8,) stays where it is under force u (2,), to 1e-6."""
     return bool(np.abs(dynamics.derivative(params, np.asarray(x), np.asarray(u))).max() < 1e-6)
@@ -89,7 +65,7 @@ def lqr_at_end(
     return None, _GOAL_PRICE * goal_weight(task, x, c, t)
 
 
-def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray) -> Gains:
+def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray) -> Gains:
     """Time-varying LQR, backwards from the final cost-to-go.
 
     Args:
@@ -123,14 +99,14 @@ def tracking_gains(
 
     The first point is at the episode's time `start`, s.
     """
-    return riccati(*_steps(task, params, x, u, c, start), p_final)
+    return _riccati(*_steps(task, params, x, u, c, start), p_final)
 
 
 def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
     """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
     steps, after = _steps(task, params, reference.x, reference.u, c), np.eye(reference.x.shape[1])
     for _ in range(_MAX_ROUNDS):
-        gains = riccati(*steps, after)
+        gains = _riccati(*steps, after)
         if np.allclose(after, gains.p[0], rtol=1e-6):
             return gains
         after = gains.p[0]
@@ -140,7 +116,7 @@ def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.
 def _steps(
     task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, start: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What `riccati` takes of the control steps at states x (n, 8) and forces u (n, 2)."""
+    """What `_riccati` takes of the control steps at states x (n, 8) and forces u (n, 2)."""
     dt = task.control_dt
     q, r = quadratic_cost(task, x, u, c, start + dt * np.arange(len(x)))
     return *discretize(params, x, u, dt), q * dt, r * dt
@@ -172,39 +148,30 @@ def feedforward(
     return forces
 
 
-class LqrController:
-    """LQR about the task's reference motion, with weights from the task's own cost.
+def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray) -> np.ndarray:
+    """Feedback about an optimum of n steps, (n, 2, 8), N per unit of the state.
 
-    About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
-    gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one,
-    with forces that look ahead, because it may be no motion of the robot (`feedforward`).
-
-    After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
+    The gains are TVLQR's. If the task ends in its goal, only those goal functions that limit the optimum are weighted at its
+    end. Weighting the whole goal would ask for forces that the optimum from a neighbouring state does not need.
     """
+    end, h = trajectory.x[-1], 1e-5
+    if task.first_exit:
+        goal = np.array(task.goal(end, c), np.float64)
+        slopes = np.array(
+            [np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(len(end))]
+        )
+        active = slopes[:, goal > goal.max() - _ACTIVE]
+        p_final = active @ active.T + 1e-3 * np.eye(len(end))
+    else:
+        _, p_final = lqr_at_end(task, params, end, c, trajectory.t[-1])
+    return tracking_gains(task, params, *held_steps(trajectory, task.control_dt), c, p_final, trajectory.t[0]).k
 
-    def __init__(self, task: Task, params: BallbotParams):
-        self._task, self._params = task, params
 
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        task, params = self._task, self._params
-        self._start = t
-        found = task.reference(x[:8], c, params)
-        states, forces = omni.with_wheels(params, found.x, found.u)
-        self.reference = reference = replace(found, x=states, u=forces)
-        if reference.closed:
-            self.gains = closed_gains(task, params, reference, c)
-        else:
-            _, p_final = lqr_at_end(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
-            self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, t)
-            if task.clock:
-                self.reference = replace(
-                    reference, u=reference.u + feedforward(task, params, reference, c, self.gains, t)
-                )
+def held_steps(trajectory: Trajectory, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 8) at the starts of a trajectory's control steps, and the forces (n, 2) to hold over them.
 
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        reference = self.reference
-        if reference.closed:
-            i = int(np.argmin(np.sum((reference.x[:, :2] - x[:2]) ** 2, axis=1)))
-        else:
-            i = min(round((t - self._start) / self._task.control_dt), len(reference.x) - 1)
-        return reference.u[i] - self.gains.k[i] @ (x - reference.x[i])
+    A force that varies within a step is represented by its value at mid-step.
+    """
+    times = trajectory.t[0] + dt * np.arange(max(1, round(trajectory.duration / dt)))
+    middle = 0.0 if trajectory.held else 0.5 * dt
+    return np.array([trajectory.state(t) for t in times]), np.array([trajectory.force(t + middle) for t in times])

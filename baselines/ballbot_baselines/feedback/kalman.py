@@ -20,7 +20,7 @@ import casadi
 import gymnasium
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, InPlace, in_lanes
+from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
 from ballbot_gym import dynamics, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, find_optimum
+from ballbot_baselines.optimum.find import find_optimum
+from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_gym import dynamics
 from ballbot_gym.checks import finite_array
 from ballbot_gym.env import make_task

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import guess
+from ballbot_baselines.solvers import guess
 from ballbot_gym import dynamics, omni, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
@@ -32,7 +32,7 @@ _UPRIGHT, _STEADY = 0.15, 1.0  # rad and rad/s: leans and lean rates of a robot 
 
 
 @dataclass(frozen=True)
-class Member:
+class _Recovery:
     """One of the family's simulated episodes: states (n+1, 8), forces (n, 2), N, and what it costs.
 
     `side` is the side of the fall to which it leans first, −1, 0 or 1. `righted` is the step after which it is upright.
@@ -44,10 +44,25 @@ class Member:
     cost: float
     righted: int
 
+    def guesses(self, task: Task, params: BallbotParams, c: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """At most one pair of states (n+1, 8) and forces (n, 2) to start from.
+
+        It is this motion itself where that is a whole episode to the task's point of rest. Otherwise it is this motion until
+        the robot is upright, followed by the first of the task's guessed paths from there.
+        """
+        if len(self.u) == task.steps and _has_point(task, self.x[0], c, params):
+            return [(self.x, self.u)]
+        k = self.righted
+        path = task.guess_paths(self.x[k], c, params)[0][: task.steps + 1 - k]
+        if len(path) < 2:
+            return []
+        x, u = guess.along_path(params, path, task.control_dt, start=self.x[k])
+        return [(np.concatenate([self.x[:k], x]), np.concatenate([self.u[:k], u]))]
+
 
 def righted(
     task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, force: float, start: float = 0.0
-) -> list[Member]:
+) -> list[_Recovery]:
     """The cheapest member for each side of the fall that rights the robot without violating a margin, if there is one.
 
     From state x0 (8,) at the episode's time `start`, s, with constants c (nc,) and at most this force per axis, N.
@@ -79,24 +94,8 @@ def righted(
             _, cost, i = min(totals)
             first_upright = int(np.argmax(upright[:, i]))
             last = len(u) if safe[-1, i] else first_upright
-            found.append(Member(side, x[: last + 1, i], u[:last, i], float(cost), first_upright))
+            found.append(_Recovery(side, x[: last + 1, i], u[:last, i], float(cost), first_upright))
     return found
-
-
-def guesses(task: Task, params: BallbotParams, member: Member, c: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """At most one pair of states (n+1, 8) and forces (n, 2) to start from.
-
-    It is the member itself where that is a whole episode to the task's point of rest. Otherwise it is the member until it is
-    upright, followed by the first of the task's guessed paths from there.
-    """
-    if len(member.u) == task.steps and _has_point(task, member.x[0], c, params):
-        return [(member.x, member.u)]
-    k = member.righted
-    path = task.guess_paths(member.x[k], c, params)[0][: task.steps + 1 - k]
-    if len(path) < 2:
-        return []
-    x, u = guess.along_path(params, path, task.control_dt, start=member.x[k])
-    return [(np.concatenate([member.x[:k], x]), np.concatenate([member.u[:k], u]))]
 
 
 def _simulated(

@@ -16,19 +16,24 @@ What remains unsolved is left to `find_optimum`. `benchmarks/batched_optima.py` 
 
 import itertools
 import math
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
-from ballbot_baselines import guess, righting, search, sides
-from ballbot_baselines.ilqr import MARGIN, Guesses, Options, Rows, Solutions, ilqr
-from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
+from ballbot_baselines.optimum import sides
+from ballbot_baselines.optimum.guesses import BASIN_DOUBT, COARSE, CONSIDERED, contenders, side_doubt, straight_path
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.solvers import guess, righting
+from ballbot_baselines.solvers.ilqr import MARGIN, Motions, Options, ilqr
+from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import sides_passed
 from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
 
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
 _FAMILY = (*itertools.product((7.0, 14.0), (1.0, 1.4), (0.0,), (1.0,)), (10.0, 2.0, 0.0, 1.0))
@@ -59,48 +64,10 @@ _AT_REST = 1e-5  # relative to an episode's cost: how wrong LQR's cost-to-go may
 _SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
 _FEW = 16  # problems
 _AT_ONCE = 256  # episodes in memory
-_GUESSES = 5  # as of `find_optimum`
-
-
-@dataclass(frozen=True)
-class BatchOptima(Rows):
-    """Optima of B episodes of at most n control steps.
-
-    | field | shape | meaning |
-    |---|---|---|
-    | costs | (B,) | NaN where not solved |
-    | solved | (B,) bool | it converged, and obeys every constraint |
-    | steps | (B,) | control steps, fewer than n where a goal is reached |
-    | states | (B, n+1, 8) | after its end an episode's last state is repeated |
-    | forces | (B, n, 2) | N |
-    | gains | (B, n, 2, 8) | K of the feedback u − K (x' − x) about the optimum, N per unit of the state |
-    | slopes | (B, n, 8) | of the remaining cost with respect to each state but the last |
-    """
-
-    costs: np.ndarray
-    solved: np.ndarray
-    steps: np.ndarray
-    states: np.ndarray
-    forces: np.ndarray
-    gains: np.ndarray
-    slopes: np.ndarray
-
-    @classmethod
-    def empty(cls, count: int, n: int, state_size: int = 8, action_size: int = 2) -> "BatchOptima":
-        """Of `count` episodes of n control steps, none of them solved."""
-        return cls(
-            costs=np.full(count, np.nan),
-            solved=np.zeros(count, bool),
-            steps=np.full(count, n),
-            states=np.zeros((count, n + 1, state_size)),
-            forces=np.zeros((count, n, action_size)),
-            gains=np.zeros((count, n, action_size, state_size)),
-            slopes=np.zeros((count, n, state_size)),
-        )
 
 
 def solves(task: Task, params: BallbotParams) -> bool:
-    """Whether `find_optima` can solve this task here: C code can be compiled, it has all operations of the task, the task has
+    """Whether `search_many` can solve this task here: C code can be compiled, it has all operations of the task, the task has
     no clock, and the robot no wheels.
     """
     try:
@@ -110,56 +77,27 @@ def solves(task: Task, params: BallbotParams) -> bool:
     return True
 
 
-def find_optima(
-    task: Task,
-    params: BallbotParams,
-    x0: np.ndarray,
-    c: np.ndarray,
-    backoff: Backoff = Backoff(),
-) -> BatchOptima:
-    """Optimizes B episodes on one core.
-
-    Args:
-        task: one that `solves` admits.
-        params: the robot.
-        x0: (B, 8) initial states.
-        c: (B, nc) constants.
-        backoff: what they keep from margins and goal, and of the grip.
+def search_many(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff
+) -> list[Optimum | None]:
+    """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
 
     Raises:
-        ValueError: an array has the wrong shape.
-        machine_code.NoMachineCodeError, NotImplementedError: the task is none that `solves` admits.
+        machine_code.NoMachineCodeError, NotImplementedError: the task is none that it `solves`.
     """
-    x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
-    if x0.ndim != 2 or x0.shape[1] != 8:
-        raise ValueError(f"x0 must have the shape (B, 8), not {x0.shape}")
-    count, n, nc = len(x0), task.steps, len(task.constant_names)
-    if c.shape != (count, nc):
-        raise ValueError(f"c must have the shape ({count}, {nc}), not {c.shape}")
-    optima = BatchOptima.empty(count, n)
-    for first in range(0, count, _AT_ONCE):
-        rows = slice(first, first + _AT_ONCE)
-        _Batch(
-            task,
-            params,
-            x0[rows],
-            c[rows],
-            optima.some(rows),
-            replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal)),
-        ).search()
-    optima.solved[:] = np.isfinite(optima.costs)
-    return optima
+    backoff = replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal))
+    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(x0), _AT_ONCE)]
+    return [optimum for some in parts for optimum in _Batch(task, params, x0[some], c[some], backoff).optima()]
 
 
 class _Batch:
-    """The search of some episodes, which fills in their `BatchOptima`."""
+    """The search of some episodes."""
 
-    def __init__(
-        self, task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, optima: BatchOptima, backoff: Backoff
-    ):
-        self._task, self._params, self._x0, self._c, self._optima = task, params, x0, c, optima
-        self._backoff = backoff
+    def __init__(self, task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff):
+        self._task, self._params, self._x0, self._c, self._backoff = task, params, x0, c, backoff
         self._solver = ilqr(task, params)
+        self._costs = np.full(len(x0), np.inf)
+        self._best: dict[int, tuple[Motions, int]] = {}  # of each solved episode, and the row that it has among others
 
     @cached_property
     def _ends(self) -> np.ndarray:
@@ -172,15 +110,42 @@ class _Batch:
         """(n, 3) of each slalom, as `Task.passed_obstacles` gives them."""
         return [np.asarray(self._task.passed_obstacles(c)) for c in self._c]
 
-    def search(self) -> None:
+    def optima(self) -> list[Optimum | None]:
+        """The best that is found of each episode."""
+        started = time.perf_counter()
+        with np.errstate(all="ignore"):  # motions that diverge may overflow, and are left out
+            self._search()
+        seconds = (time.perf_counter() - started) / max(1, len(self._x0))
+        return [self._optimum(*self._best[i], seconds) if i in self._best else None for i in range(len(self._x0))]
+
+    def _optimum(self, found: Motions, i: int, seconds: float) -> Optimum:
+        task, limit, n = self._task, self._params.force_limit, found.steps[i]
+        end = np.full((1, found.x.shape[2]), np.nan if task.first_exit else 0.0)
+        return Optimum(
+            cost=float(found.costs[i]),
+            trajectory=Trajectory(
+                task.control_dt * np.arange(n + 1), found.x[i, : n + 1].copy(), limit * found.a[i, :n]
+            ),
+            status="optimal",
+            solver_status="converged",
+            violation=0.0,  # each constraint is kept by as much as it may be missed
+            iterations=0,
+            solver="ilqr",
+            seconds=seconds,
+            slopes=np.concatenate([found.slopes[i, :n], end]),
+            markers=tuple(task.markers(self._c[found.of[i]])),
+            feedback=partial(np.multiply, limit, found.gains[i, :n].copy()),
+        )
+
+    def _search(self) -> None:
         task = self._task
         if task.first_exit:
             self._arrive()
-        elif task.passed_obstacles(self._c[0]) is not None and task.steps % search.COARSE == 0:
+        elif task.passed_obstacles(self._c[0]) is not None and task.steps % COARSE == 0:
             self._weave()
         elif len(task.reference(self._x0[0], self._c[0], self._params).x) == 1:
             self._keep(self._recoveries(), _MOTION)  # over the first seconds where LQR is right about the rest
-            self._follow_paths(np.flatnonzero(np.isnan(self._optima.costs)))
+            self._follow_paths(np.flatnonzero(np.isinf(self._costs)))
         else:
             self._follow_paths(np.arange(len(self._x0)))
 
@@ -204,14 +169,14 @@ class _Batch:
 
     def _solve(
         self,
-        guesses: Guesses,
+        guesses: Motions,
         tries: Sequence[Options],
         coarseness: int = 1,
         c: np.ndarray | None = None,
         free_time: bool = False,
         chosen_sides: np.ndarray | None = None,
         end_multipliers: np.ndarray | None = None,
-    ) -> Solutions:
+    ) -> Motions:
         """Solves guesses with some options in turn until they are solved, and on chosen sides (J, obstacles) of obstacles.
 
         They may start from multipliers (J, ne) of the end.
@@ -251,7 +216,7 @@ class _Batch:
         return found
 
     def _keep(
-        self, guesses: Guesses, tries: Sequence[Options], end_multipliers: np.ndarray | None = None
+        self, guesses: Motions, tries: Sequence[Options], end_multipliers: np.ndarray | None = None
     ) -> np.ndarray:
         """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,).
 
@@ -262,7 +227,7 @@ class _Batch:
             return np.zeros(0)
         return self._kept(self._solve(guesses, tries, end_multipliers=end_multipliers))
 
-    def _kept(self, found: Solutions) -> np.ndarray:
+    def _kept(self, found: Motions) -> np.ndarray:
         if self._solver.rest is not None and found.a.shape[1] < self._task.steps:
             found = self._to_the_end(found)
             again = np.flatnonzero(~found.solved & np.isfinite(found.costs))
@@ -270,23 +235,14 @@ class _Batch:
         self._write(found)
         return found.costs
 
-    def _write(self, found: Solutions) -> None:
+    def _write(self, found: Motions) -> None:
         """Keeps the cheapest solution of every episode."""
-        optima, limit = self._optima, self._params.force_limit
-        for i in np.argsort(-found.costs, kind="stable"):  # the cheapest last
-            row, steps = found.of[i], found.steps[i]
-            if not found.solved[i] or found.costs[i] >= optima.costs[row]:
-                continue
-            optima.costs[row], optima.steps[row] = found.costs[i], steps
-            optima.states[row] = found.x[i, np.minimum(np.arange(self._task.steps + 1), steps)]
-            for kept, values, unit in (
-                (optima.forces, found.a, limit),
-                (optima.gains, found.gains, limit),
-                (optima.slopes, found.slopes, 1.0),
-            ):
-                kept[row, :steps], kept[row, steps:] = unit * values[i, :steps], 0
+        for i in np.flatnonzero(found.solved).tolist():
+            row, cost = int(found.of[i]), found.costs[i]
+            if cost < self._costs[row]:
+                self._costs[row], self._best[row] = cost, (found, i)
 
-    def _to_the_end(self, found: Solutions) -> Solutions:
+    def _to_the_end(self, found: Motions) -> Motions:
         """Whole episodes, of solutions of their first seconds and LQR then: solved where LQR's cost-to-go was right."""
         rest, ends, limit = self._solver.rest, self._ends[found.of], self._params.force_limit
         assert rest is not None
@@ -306,7 +262,7 @@ class _Batch:
         whole.solved[:] &= np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
         return whole
 
-    def _recoveries(self) -> Guesses:
+    def _recoveries(self) -> Motions:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
         task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
         n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
@@ -329,13 +285,13 @@ class _Batch:
                 cheaper = costs < best[rows]
                 for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
                     kept[rows[cheaper]] = values[cheaper]
-        return Guesses(np.arange(count), np.full(count, n), x, a).some(np.isfinite(best))
+        return Motions.guessed(np.arange(count), np.full(count, n), x, a).some(np.isfinite(best))
 
-    def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> Guesses:
+    def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> Motions:
         """Guesses along ground paths (steps+1, 2) of the same number of steps."""
         x, a = self._motion(np.array(paths), self._task.control_dt, self._x0[of])
         a = a[:, ::coarseness]
-        return Guesses(np.asarray(of), np.full(len(a), a.shape[1]), x[:, ::coarseness], a)
+        return Motions.guessed(np.asarray(of), np.full(len(a), a.shape[1]), x[:, ::coarseness], a)
 
     def _motion(self, path: np.ndarray, length: float | np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, u = guess.along_path(self._params, path, length, start=x0)
@@ -345,7 +301,7 @@ class _Batch:
         """Guessed paths, and of which episodes."""
         of, paths = [], []
         for i in rows.tolist():
-            some = self._task.guess_paths(self._x0[i], self._c[i], self._params)[:_GUESSES]
+            some = self._task.guess_paths(self._x0[i], self._c[i], self._params)[:CONSIDERED]
             of += [i] * len(some)
             paths += some
         return of, paths
@@ -356,9 +312,9 @@ class _Batch:
             return
         of, paths = self._paths(rows)
         chosen = np.arange(len(of))
-        if len(of) > len(rows) and self._task.steps % search.COARSE == 0:
-            found = self._solve(self._along(of, paths, search.COARSE), _ROUGH_PATH, search.COARSE)
-            chosen = _contenders(found, search.BASIN_DOUBT)
+        if len(of) > len(rows) and self._task.steps % COARSE == 0:
+            found = self._solve(self._along(of, paths, COARSE), _ROUGH_PATH, COARSE)
+            chosen = _contenders(found, BASIN_DOUBT)
         self._keep(self._along([of[i] for i in chosen], [paths[i] for i in chosen]), _PATH)
 
     def _arrive(self) -> None:
@@ -368,9 +324,9 @@ class _Batch:
         lengths = np.array([len(path) - 1 for path in paths]) * task.control_dt / n
         x, a = self._motion(np.array([guess.resampled(path, n) for path in paths]), lengths, self._x0[of])
         x = np.concatenate([x, np.broadcast_to(lengths[:, None, None], (len(of), n + 1, 1))], axis=-1)
-        motions = Guesses(np.array(of), np.full(len(of), n), x, a)
+        motions = Motions.guessed(np.array(of), np.full(len(of), n), x, a)
         relaxed = self._solve(motions, _ROUGH_GOAL, free_time=True)
-        chosen = _contenders(relaxed, search.BASIN_DOUBT)
+        chosen = _contenders(relaxed, BASIN_DOUBT)
         arrivals = np.ceil(relaxed.x[chosen, 0, 8] * n / task.control_dt).astype(int)
         tried: dict[int, dict[int, float]] = {i: {} for i in chosen.tolist()}  # costs by number of steps
         wanted = [
@@ -384,10 +340,10 @@ class _Batch:
             x, a = np.zeros((len(rows), steps.max() + 1, 8)), np.zeros((len(rows), steps.max(), 2))
             for s in np.unique(steps).tolist():
                 some = rows[steps == s]
-                x[steps == s, : s + 1] = guess.resampled(relaxed.x[some, :, :8], s)
-                held = np.concatenate([relaxed.a[some], relaxed.a[some, -1:]], axis=1)
-                a[steps == s, :s] = guess.resampled(held, s)[:, :-1]
-            guesses = Guesses(relaxed.of[rows], steps, x, a)
+                x[steps == s, : s + 1], a[steps == s, :s] = guess.motion_resampled(
+                    relaxed.x[some, :, :8], relaxed.a[some], s
+                )
+            guesses = Motions.guessed(relaxed.of[rows], steps, x, a)
             found = self._keep(guesses, _NEAR_GOAL, relaxed.end_multipliers[rows])
             for (i, s), cost in zip(wanted, found.tolist(), strict=True):
                 tried[i][s] = cost
@@ -401,13 +357,13 @@ class _Batch:
         """Slaloms: likely choices of sides are compared with forces held longer, over the time until LQR is right about the
         rest.
         """
-        task, params, coarse, every = self._task, self._params, search.COARSE, np.arange(len(self._x0))
-        straight = [search.straight_path(task, params, x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
+        task, params, coarse, every = self._task, self._params, COARSE, np.arange(len(self._x0))
+        straight = [straight_path(task, params, x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
         away = np.array([task.without_obstacles(c) for c in self._c])
         free = self._solve(self._along(every.tolist(), straight, coarse), _ROUGH_PATH, coarse, c=away)
         along = guess.resampled(free.x[..., :1], task.steps)[..., 0]
         goal_y = np.array([straight_one[-1, 1] for straight_one in straight])
-        doubt = search.GRIPPING_DOUBT if params.grips else search.SIDE_DOUBT
+        doubt = side_doubt(params)
         likely: dict[int, dict[int, np.ndarray]] = {}  # choices by the steps that are optimized, and by episode
         counts = np.where(free.solved, [len(each) for each in self._obstacles], 0)
         for count in np.unique(counts[counts > 0]):
@@ -428,7 +384,7 @@ class _Batch:
 
     def _pass_obstacles(self, likely: Mapping[int, np.ndarray], steps: int) -> None:
         """The best of likely choices of sides (k, obstacles) of episodes, whose first control steps are optimized."""
-        task, coarse = self._task, search.COARSE
+        task, coarse = self._task, COARSE
         of = [i for i, choices in likely.items() for _ in choices]
         paths = [
             task.routed_path(self._x0[i], self._c[i], tuple(chosen.tolist()))[: steps + 1]
@@ -442,14 +398,14 @@ class _Batch:
             return
         x = np.array([guess.resampled(states, steps) for states in rough.x[chosen]])
         a = np.repeat(rough.a[chosen], coarse, axis=1)
-        near = Guesses(rough.of[chosen], np.full(len(chosen), steps), x, a)
+        near = Motions.guessed(rough.of[chosen], np.full(len(chosen), steps), x, a)
         found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=wanted[chosen])
         self._pass_later(found)
         left = chosen[np.isinf(self._kept(found))]
         if len(left):
             self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
 
-    def _pass_later(self, found: Solutions) -> None:
+    def _pass_later(self, found: Motions) -> None:
         """Replaces the best solution of every episode by one that passes the obstacles a control step later or earlier, where
         that is cheaper.
 
@@ -466,7 +422,7 @@ class _Batch:
         )
         x[:, 0] = found.x[two, 0]
         multipliers = np.maximum(multipliers, _SHIFTED.multiplier)
-        guesses = Guesses(found.of[two], found.steps[two], x, a)
+        guesses = Motions.guessed(found.of[two], found.steps[two], x, a)
         given, ends = self._given(guesses.of, a.shape[1]), found.end_multipliers[two]
         moved = self._solver.solve(guesses, self._task.control_dt, given, [_SHIFTED] * len(two), multipliers, ends)
         moved.costs[~moved.solved] = np.inf
@@ -481,13 +437,15 @@ def _shifted(values: np.ndarray, later: int) -> np.ndarray:
     return values[:, np.clip(np.arange(n) - later, 0, n - 1)]
 
 
-def _contenders(found: Solutions, doubt: float) -> np.ndarray:
-    """Which of J solutions are within a relative doubt of the cheapest of their episode, without repetitions."""
-    kept: dict[int, list[int]] = {}
-    for i in np.argsort(found.costs, kind="stable").tolist():
-        others = kept.setdefault(int(found.of[i]), [])
-        if not math.isfinite(found.costs[i]) or (others and found.costs[i] > found.costs[others[0]] * (1 + doubt)):
-            continue
-        if all(np.abs(found.x[i, :, :2] - found.x[j, :, :2]).max() > _SAME for j in others):
-            others.append(i)
-    return np.array(sorted(itertools.chain(*kept.values())), int)
+def _contenders(found: Motions, doubt: float) -> np.ndarray:
+    """Which of J solutions are `contenders` for the optimum of their episode."""
+
+    def same(i: int, j: int) -> bool:
+        return bool(np.abs(found.x[i, :, :2] - found.x[j, :, :2]).max() <= _SAME)
+
+    chosen = []
+    for episode in np.unique(found.of):
+        rows = np.flatnonzero(found.of == episode)
+        mine = contenders(found.costs[rows], doubt, lambda i, j, rows=rows: same(rows[i], rows[j]))
+        chosen += rows[mine].tolist()
+    return np.array(sorted(chosen), int)

@@ -25,12 +25,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.horizon import grid, horizon_qp
-from ballbot_baselines.linearize import quadratic_cost
-from ballbot_baselines.optimum import Optimum, plan_to_track
-from ballbot_baselines.shooting import Backoff, RobotKind
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
+from ballbot_baselines.feedback.horizon import grid, horizon_qp
+from ballbot_baselines.feedback.tvlqr import TvlqrController
+from ballbot_baselines.optimum.find import plan_to_track
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.solvers.linearize import quadratic_cost
+from ballbot_baselines.solvers.shooting import Backoff, RobotKind
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
@@ -137,7 +138,7 @@ class NmpcController:
         q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c, trajectory.t[:-1])
         self._q, self._r = 2 * q, 2 * r * robot.force_limit**2  # Hessians of the cost rate in states and actions
         # of the cost-to-go from each state, whose second derivatives are the tracker's
-        self._slopes = np.concatenate([np.zeros((1, robot.state_size)), plan.costates])
+        self._slopes = plan.slopes
         # sums of the actions before each step
         sums = np.cumsum(trajectory.u, axis=0) / robot.force_limit
         self._sums = np.concatenate([np.zeros((1, robot.action_size)), sums])

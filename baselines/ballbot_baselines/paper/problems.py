@@ -11,11 +11,12 @@ from functools import partial
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.collocation import Guess, Plan, Problem, solve
-from ballbot_baselines.guess import along_path
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.feedback.lqr import LqrController
+from ballbot_baselines.feedback.trajopt import TrajoptController
+from ballbot_baselines.feedback.tvlqr import TvlqrController
+from ballbot_baselines.paper.collocation import Guess, Plan, Problem, solve
+from ballbot_baselines.solvers.guess import along_path
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared
@@ -236,13 +237,12 @@ def compare_stabilization(entry: PaperProblem) -> dict[str, Episode]:
 
     They start from the initial state of the paper's problem.
     """
-    envs = {
-        "lqr": BallbotEnv("stabilize", control_dt=LQR_DT, physics_dt=LQR_DT / 4),
-        "trajopt": BallbotEnv("stabilize"),
+    runs = {
+        "lqr": (LqrController, BallbotEnv("stabilize", control_dt=LQR_DT, physics_dt=LQR_DT / 4)),
+        "trajopt": (TrajoptController, BallbotEnv("stabilize")),
     }
     episodes = {}
-    for name, env in envs.items():
-        controller = CONTROLLERS[name](env.task, env.params)
-        episodes[name] = rollout(env, controller, options={"state": entry.problem.initial[0]})
+    for name, (kind, env) in runs.items():
+        episodes[name] = rollout(env, kind(env.task, env.params), options={"state": entry.problem.initial[0]})
         env.close()
     return episodes

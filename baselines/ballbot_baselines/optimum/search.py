@@ -10,34 +10,32 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines import guess, righting, sides
-from ballbot_baselines.ocp import OcpSolution
-from ballbot_baselines.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
+from ballbot_baselines.optimum import sides
+from ballbot_baselines.optimum.guesses import (
+    ALL_GUESSES,
+    BASIN_DOUBT,
+    COARSE,
+    GRIPPING_DOUBT,
+    contenders,
+    side_doubt,
+    straight_path,
+)
+from ballbot_baselines.solvers import guess, righting
+from ballbot_baselines.solvers.ocp import Solution
+from ballbot_baselines.solvers.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
 from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.paths import cubic, sides_passed, then_stay
-from ballbot_gym.tasks import Task
-
-ALL_GUESSES = 2**10
-"""`guesses` that make `find_optimum` solve every guess."""
+from ballbot_gym.paths import sides_passed
 
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
 _HIGH_BARRIER = 1.0  # from one start in thousands fatrop goes in circles with the usual one, and not with this
-COARSE = 2
-"""Control steps per interval when several guesses are compared."""
 _COARSEST = 4  # the same when choices of sides are compared first
 _ROUGH = 1e-4  # tolerance there: costs are then right to 1e-5 of their value, in four iterations less
-BASIN_DOUBT = 0.01
-"""Paths whose coarse costs differ by less than this share may be ordered differently on the env's grid."""
-SIDE_DOUBT = 0.01  # choices of sides whose predicted cost exceeds the best by more than this share are not solved
 _COARSEST_DOUBT = 0.005  # relative: how differently the coarsest grid may order choices of sides; 0.0035 was measured
 _GRID_DOUBT = 0.002  # the same of the coarse grid; 0.0007 was measured
 _GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
-GRIPPING_DOUBT = 0.02  # for such robots in place of `SIDE_DOUBT` and `_GRID_DOUBT`, because predictions ignore friction
-_STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 
 
-def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[OcpSolution]]:
+def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[Solution]]:
     """Every solution found, one kind of guess after the other. The first kind that leads to an optimum suffices.
 
     Args:
@@ -64,12 +62,12 @@ def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) ->
         yield _from_paths(episode, paths)
 
 
-def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[OcpSolution]:
+def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[Solution]:
     """With fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
     return [episode.solve(*episode.along(path), barrier=barrier, iterations=_QUICK_ITERATIONS)]
 
 
-def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[OcpSolution]:
+def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Solution]:
     """Every solution found.
 
     Paths of first-exit tasks are first solved with a free interval length, which gives their costs and their times of
@@ -94,44 +92,41 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[OcpSolution]
     return _refined(episode, [solution for solution in coarse if solution.is_optimal], BASIN_DOUBT, paths)
 
 
-def _refined(episode: Shooting, coarse: list[OcpSolution], doubt: float, paths: list[np.ndarray]) -> list[OcpSolution]:
+def _refined(episode: Shooting, coarse: list[Solution], doubt: float, paths: list[np.ndarray]) -> list[Solution]:
     """Solves from the coarse solutions within a relative `doubt` of the best; along the paths, if there are none."""
     near = [_on_grid(solution, episode.task.steps) for solution in _distinct(coarse, doubt)]
     starts = near or map(episode.along, paths)
     return [solution for x, a in starts for solution in episode.solve_to_the_end(x, a, near=bool(near))]
 
 
-def _on_grid(solution: OcpSolution, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def _on_grid(solution: Solution, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """States and actions of a solution on a finer grid."""
     return guess.resampled(solution.states, steps), np.repeat(solution.inputs, steps // len(solution.inputs), axis=0)
 
 
-def _distinct(solved: list[OcpSolution], doubt: float) -> list[OcpSolution]:
-    """The solutions within a relative `doubt` of the best, sorted by cost, without repetitions."""
-    kept: list[OcpSolution] = []
-    for solution in sorted(solved, key=lambda each: each.cost):
-        contends = not kept or solution.cost < kept[0].cost * (1 + doubt)
-        if contends and not any(math.isclose(solution.cost, other.cost, rel_tol=1e-5) for other in kept):
-            kept.append(solution)
-    return kept
+def _distinct(solved: list[Solution], doubt: float) -> list[Solution]:
+    """Those of the solutions that are `contenders`."""
+    costs = [solution.cost for solution in solved]
+    found = contenders(costs, doubt, lambda i, j: math.isclose(costs[i], costs[j], rel_tol=1e-5))
+    return [solved[i] for i in found]
 
 
 # --- simulated recoveries ---
 
 
-def _from_righting(episode: Shooting) -> list[OcpSolution]:
+def _from_righting(episode: Shooting) -> list[Solution]:
     """Solutions from simulated recoveries, to either side of the fall; and those recoveries that are episodes themselves.
 
     The recovery within the plane of the fall is tried last, because it may lead to a saddle point.
     """
     task, params, c, limit = episode.task, episode.params, episode.c, episode.params.force_limit
-    found: list[OcpSolution] = []
+    found: list[Solution] = []
     for member in righting.righted(task, params, episode.x0, c, (1 - episode.backoff.force) * limit, episode.start):
         if not task.first_exit and len(member.u) == task.steps:
-            found.append(_simulated(episode, member))
+            found.append(_simulated(episode, member.x, member.u, member.cost))
         if member.side == 0 and any(solution.is_optimal for solution in found):
             break
-        for x, u in righting.guesses(task, params, member, c):
+        for x, u in member.guesses(task, params, c):
             if task.first_exit:
                 relaxed = episode.relaxed(x, u / limit, task.control_dt)
                 found += episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
@@ -140,32 +135,30 @@ def _from_righting(episode: Shooting) -> list[OcpSolution]:
     return found
 
 
-def _simulated(episode: Shooting, member: righting.Member) -> OcpSolution:
+def _simulated(episode: Shooting, x: np.ndarray, u: np.ndarray, cost: float) -> Solution:
     """A simulated recovery that lasts the whole episode as a solution."""
     task, params, c, backoff = episode.task, episode.params, episode.c, episode.backoff
-    t = episode.start + task.control_dt * np.arange(len(member.x))
-    room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], task.at(c, t[-1]))]
-    room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, task.at(c, t))]
-    room += dynamics.limits(params, member.x[:-1], member.u, backoff.grip, task.control_dt)
-    return OcpSolution(
+    t = episode.start + task.control_dt * np.arange(len(x))
+    room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(x[-1], task.at(c, t[-1]))]
+    room += [np.asarray(margin) - backoff.margin for margin in task.margins(x, task.at(c, t))]
+    room += dynamics.limits(params, x[:-1], u, backoff.grip, task.control_dt)
+    return Solution(
         success=False,
         status="simulated feedback",
-        cost=member.cost,
-        states=member.x,
-        inputs=member.u / params.force_limit,
+        cost=cost,
+        states=x,
+        inputs=u / params.force_limit,
         violation=max(0.0, -min(float(np.min(part)) for part in room)),
         iterations=0,
         solver="simulation",
-        costates=np.zeros((len(member.u), params.state_size)),
+        slopes=np.zeros((len(x), params.state_size)),
     )
 
 
 # --- the sides of a slalom ---
 
 
-def _from_likely_sides(
-    episode: Shooting, paths: list[np.ndarray], most: int, obstacles: np.ndarray
-) -> list[OcpSolution]:
+def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, obstacles: np.ndarray) -> list[Solution]:
     """As `_from_paths`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
 
     The motion without obstacles comes first: it takes few iterations, and it predicts what every choice costs, and how the
@@ -173,13 +166,13 @@ def _from_likely_sides(
     there is no motion without obstacles, nothing is solved.
     """
     task, params, x0, c = episode.task, episode.params, episode.x0, episode.c
-    iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, SIDE_DOUBT, _GRID_DOUBT
+    iterations, grid_doubt, doubt = _QUICK_ITERATIONS, _GRID_DOUBT, side_doubt(params)
     coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else COARSE), _ROUGH
     if params.grips:
-        iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, GRIPPING_DOUBT, GRIPPING_DOUBT
+        iterations, grid_doubt = _GRIPPING_ITERATIONS, GRIPPING_DOUBT
         coarsest, tolerance = COARSE, None
 
-    def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> OcpSolution:
+    def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> Solution:
         x, a = (part[::coarsest] for part in episode.along(path))
         return episode.solve(x, a, coarsest, barrier=barrier, iterations=iterations, tolerance=tolerance)
 
@@ -192,10 +185,10 @@ def _from_likely_sides(
     rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
     row_of = [rows[sides_passed(path, obstacles)] for path in paths]
     predicted, across = free.cost + prediction.costs[0, row_of], prediction.y(0)[row_of]
-    solved: list[OcpSolution] = []
+    solved: list[Solution] = []
     least = math.inf  # that was predicted of a choice that is solved
     for i in np.argsort(predicted, kind="stable")[:most].tolist():
-        if predicted[i] > least * (1 + side_doubt):
+        if predicted[i] > least * (1 + doubt):
             break
         motion = np.column_stack([motion[:, 0], across[i]])
         for start, barrier in ((motion, NEAR_BARRIER), (motion, BARRIER), (paths[i], BARRIER)):
@@ -209,16 +202,9 @@ def _from_likely_sides(
     return _refined(episode, solved, grid_doubt, paths[:most])
 
 
-def _on_coarse_grid(episode: Shooting, solved: list[OcpSolution]) -> list[OcpSolution]:
+def _on_coarse_grid(episode: Shooting, solved: list[Solution]) -> list[Solution]:
     """Solutions with forces held for `COARSE` control steps, from those on the coarsest grid."""
     n = episode.task.steps // COARSE
     rough = {"barrier": NEAR_BARRIER, "iterations": _QUICK_ITERATIONS, "tolerance": _ROUGH}
     found = [episode.solve(*_on_grid(solution, n), COARSE, **rough) for solution in solved]
     return [solution for solution in found if solution.success]
-
-
-def straight_path(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(steps+1, 2) m, from the position and velocity of x0 to rest where the task's reference ends."""
-    goal = task.reference(x0, c, params).x[-1, :2]
-    steps = min(task.steps, round(_STRAIGHT_SECONDS / task.control_dt))
-    return then_stay(cubic(x0[:2], x0[4:6], goal, np.zeros(2), steps, task.control_dt), task.steps)

@@ -17,15 +17,15 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
 
-from ballbot_baselines import righting
-from ballbot_baselines.compiled import LANES, SIMD
-from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_baselines.shooting import RobotKind, kind_of, ocp_of
+from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.compiled import LANES, SIMD
+from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium
+from ballbot_baselines.solvers.shooting import RobotKind, kind_of, ocp_of
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
@@ -56,20 +56,9 @@ class Options(NamedTuple):
     """Of every constraint, at first."""
 
 
-Some = TypeVar("Some", bound="Rows")
-
-
-class Rows:
-    """Arrays of many problems, a row for each."""
-
-    def some(self: Some, rows: np.ndarray | slice) -> Some:
-        """Those of some problems: copies, or views for a slice."""
-        return type(self)(*(getattr(self, field.name)[rows] for field in fields(cast(Any, self))))
-
-
 @dataclass(frozen=True)
-class Guesses(Rows):
-    """Of J problems of at most n steps; those with fewer have no meaning at the end.
+class Motions:
+    """J motions of at most n steps, and what is known of them. Those with fewer steps have no meaning at the end.
 
     | field | shape | meaning |
     |---|---|---|
@@ -77,20 +66,6 @@ class Guesses(Rows):
     | steps | (J,) | n at most |
     | x | (J, n+1, ns) | states; ns is 9 with the length of a step, s, where that is free |
     | a | (J, n, 2) | actions |
-    """
-
-    of: np.ndarray
-    steps: np.ndarray
-    x: np.ndarray
-    a: np.ndarray
-
-
-@dataclass(frozen=True)
-class Solutions(Guesses):
-    """What guesses led to.
-
-    | field | shape | meaning |
-    |---|---|---|
     | gains | (J, n, 2, ns) | K of the feedback a − K (x' − x) |
     | slopes | (J, n, ns) | of the remaining cost with respect to each state but the last |
     | costs | (J,) | |
@@ -99,6 +74,10 @@ class Solutions(Guesses):
     | end_multipliers | (J, ne) | of those of the last state |
     """
 
+    of: np.ndarray
+    steps: np.ndarray
+    x: np.ndarray
+    a: np.ndarray
     gains: np.ndarray
     slopes: np.ndarray
     costs: np.ndarray
@@ -106,14 +85,24 @@ class Solutions(Guesses):
     multipliers: np.ndarray
     end_multipliers: np.ndarray
 
-    def put(self, rows: np.ndarray, others: "Solutions", which: np.ndarray) -> None:
-        """Puts the others' solutions `which` in place of the rows at the same indices."""
+    @classmethod
+    def guessed(cls, of: np.ndarray, steps: np.ndarray, x: np.ndarray, a: np.ndarray) -> "Motions":
+        """Guesses, of which nothing else is known."""
+        none = np.zeros((len(of), 0))
+        return cls(of, steps, x, a, none, none, np.full(len(of), np.inf), np.zeros(len(of), bool), none, none)
+
+    def some(self, rows: np.ndarray | slice) -> "Motions":
+        """Those in some rows: copies, or views for a slice."""
+        return Motions(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def put(self, rows: np.ndarray, others: "Motions", which: np.ndarray) -> None:
+        """Puts the motions `which` of others in place of the rows at the same indices."""
         for field in fields(self):
             getattr(self, field.name)[rows[which]] = getattr(others, field.name)[which]
 
 
 @dataclass(frozen=True)
-class Rest:
+class _Rest:
     """LQR where a task ends at rest: its gain (2, 8), and P (8, 8) of its cost-to-go xᵀPx of states x relative to the end."""
 
     gain: np.ndarray
@@ -129,23 +118,23 @@ class Rest:
         return 0.5 * (self.slopes(off) * off).sum(axis=-1)
 
 
-def rest(task: Task, params: BallbotParams) -> Rest | None:
+def _rest(task: Task, params: BallbotParams) -> _Rest | None:
     """LQR where the task ends, if that is at rest, and the same relative to the end of every episode."""
     if task.first_exit:
         return None
-    found: list[Rest] = []
+    found: list[_Rest] = []
     for x0, c in (task.sample(np.random.default_rng(seed), params) for seed in range(2 if task.constant_names else 1)):
         end = task.reference(x0, c, params)
         if len(end.x) > 1 or not is_equilibrium(params, end.x[0], end.u[0]):
             return None
         try:
-            found.append(Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))
+            found.append(_Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))
         except PlanError:
             return None
     return found[0] if np.allclose(found[0].p, found[-1].p, rtol=1e-9) else None
 
 
-class Ilqr:
+class _Ilqr:
     """The solver of a task and a robot. `rest` says where the task ends at rest.
 
     With `free_time`, the length of the steps is free, within the last two parameters of each problem.
@@ -163,7 +152,7 @@ class Ilqr:
                 "many optima at once know no robot with wheels; find_optimum solves them one by one"
             )
         kind = kind_of(task, params)  # which refuses formulas that cannot be optimized
-        self._limit, self.rest = params.force_limit, None if free_time else rest(task, params)
+        self._limit, self.rest = params.force_limit, None if free_time else _rest(task, params)
         library, self._sizes = _compiled(*kind, free_time, self.rest is not None)
         self.states = self._sizes["STATES"]
         self._solve, self._follow = library.solve, library.follow
@@ -173,13 +162,13 @@ class Ilqr:
 
     def solve(
         self,
-        guesses: Guesses,
+        guesses: Motions,
         length: float,
         given: np.ndarray,
         options: Sequence[Options],
         multipliers: np.ndarray | None = None,
         end_multipliers: np.ndarray | None = None,
-    ) -> Solutions:
+    ) -> Motions:
         """Solves J problems.
 
         Args:
@@ -202,7 +191,7 @@ class Ilqr:
         costs, solved = np.zeros(jobs), np.zeros(jobs, np.int64)
         arrays = (settings, steps, given, x, a, m, e, gains, slopes, costs, solved)
         self._solve(jobs, n, length, *(array.ctypes.data for array in arrays))
-        return Solutions(guesses.of, steps, x, a, gains, slopes, costs, solved == 1, m, e)
+        return Motions(guesses.of, steps, x, a, gains, slopes, costs, solved == 1, m, e)
 
     def simulate(
         self,
@@ -240,7 +229,7 @@ class Ilqr:
         return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
 
 
-ilqr = functools.lru_cache(maxsize=8)(Ilqr)
+ilqr = functools.lru_cache(maxsize=8)(_Ilqr)
 """The solver, made once."""
 
 

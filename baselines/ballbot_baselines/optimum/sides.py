@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.linearize import discretize, quadratic_cost
+from ballbot_baselines.solvers.linearize import discretize, quadratic_cost
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 

@@ -9,9 +9,9 @@ from functools import lru_cache
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, LONG, SIMD, InPlace, in_lanes
-from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.shooting import RobotKind, robot_numbers
+from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
+from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
+from ballbot_baselines.solvers.shooting import RobotKind, robot_numbers
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -193,9 +193,10 @@ class HorizonQp:
         x, a, states = self.x, self.a, self._states
         self._stage()
         if self.disturbance is not None:
-            rates, slopes = self.disturbance.rates(self.x, self.a)
-            self._next += self.h[:, None] * rates
-            self._jacobian += self.h[:, None, None] * slopes
+            with np.errstate(all="ignore"):  # where the iteration diverges, this may overflow, and there is no solution
+                rates, slopes = self.disturbance.rates(self.x, self.a)
+                self._next += self.h[:, None] * rates
+                self._jacobian += self.h[:, None, None] * slopes
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)

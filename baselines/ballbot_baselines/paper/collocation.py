@@ -21,7 +21,7 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import ACCEPTABLE, Ocp, OcpSolution, OcpSolver, no_path
+from ballbot_baselines.solvers.ocp import ACCEPTABLE, Ocp, OcpSolver, Solution, no_path
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
@@ -184,7 +184,7 @@ def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def _plan(problem: Problem, params: BallbotParams, result: OcpSolution, seconds: float) -> Plan:
+def _plan(problem: Problem, params: BallbotParams, result: Solution, seconds: float) -> Plan:
     x, u = result.states[:, _X], params.force_limit * result.states[:, _A]
     t = result.states[0, _H] * np.arange(len(x))
     trajectory = Trajectory(t, x, u, xdot=dynamics.derivative(params, x, u))
