@@ -179,7 +179,7 @@ def test_the_page_is_small_and_loads_nothing(page):
     markup = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
     assert re.findall(r'(?:src|href|url)\s*[=(]\s*"?([^">)]*)', markup) == ["data:,"]
     assert not re.search(r"https?://|import\(|fetch\(|XMLHttpRequest|WebSocket", text)
-    assert text.count("<script>") == text.count("</script>") == 3
+    assert text.count("<script>") == text.count("</script>") == 4
 
 
 def test_the_page_is_the_same_every_time(page, tmp_path):
@@ -249,7 +249,7 @@ def test_in_the_browser_a_robot_that_nobody_told_has_no_regret(opened):
     cells = advance(opened, 50)[2]
     assert [row[0] for row in cells] == ["SHAC policy", "LQR"]
     assert "%" not in cells[0][5]
-    opened.execute_script("document.querySelector('.told').disabled || document.querySelector('.told').click()")
+    opened.execute_script("document.querySelector('.known').disabled || document.querySelector('.known').click()")
     assert advance(opened, 50)[2][2][0] == "optimum"
 
 

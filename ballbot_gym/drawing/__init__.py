@@ -21,6 +21,8 @@ FORCE = "#d91a8c"
 """Colour of the force's arrow."""
 PUSH = "#1a9e5c"
 """Colour of a push's arrow."""
+GOAL = "#1f6fb2"
+"""Colour of the arrow to the goal of a drive."""
 GHOST_OPACITY = 0.4
 FORCE_SCALE = 1 / 400
 """Length of the force's arrow, m/N."""
