@@ -76,7 +76,8 @@ class Playground extends Page {
     this.find("text").textContent = given
       ? "A drive is replayed. Drive it yourself, and do better."
       : driven
-      ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture."
+      ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture. " +
+        "The blue arrow shows the way. The regret is what you end with if the policy takes over now."
       : `${this.scenario.text} Drag a robot to push it, or the floor to look around.`;
     this.find("drive").setAttribute("aria-pressed", driven && !given);
     this.given = given;
@@ -86,6 +87,7 @@ class Playground extends Page {
     this.robots = robotsOf(this.scenario, this.driver, this.robot);
     // the page has the optima of the robot that everybody knows, and a regret over them would be one over something else
     this.best = this.isKnown && this.scenario.best && new Optimum(this.scenario);
+    this.guide = this.driver && new Guide(this.scenario);
     const { label, color } = DATA.policies[task];
     const learned = { label: `${label} policy`, color, alpha: 1 };
     const ghost = DATA.ghost_opacity + 0.15;
@@ -104,6 +106,7 @@ class Playground extends Page {
   /** All robots in one state, at time 0. */
   restart(state) {
     for (const robot of this.everyone) robot.reset(state);
+    this.forecast = this.driver && new Forecast(this.robots[0], this.scenario);
     this.disturbed = false; // a regret is that of an episode that nobody disturbs
     this.time = 0;
     this.late = 0; // s of the episode that are not computed yet
@@ -118,6 +121,7 @@ class Playground extends Page {
       this.hit([impulse * Math.cos(bearing), impulse * Math.sin(bearing)]);
     }
     for (const robot of this.everyone) robot.advance();
+    this.forecast?.advance();
     this.time += DATA.dt;
     if (this.driver && this.playing && this.robots[0].over) this.end();
   }
@@ -185,6 +189,7 @@ class Playground extends Page {
       const u = robot.ended ? null : robot.force;
       return { ...robot.look, label, x: this.between(robot), u, pushable, push: pushable ? push : null };
     });
+    if (this.guide && !this.robots[0].over) robots[0].goal = this.guide.ahead(robots[0].x);
     const paths = this.everyone.map(({ path, look }, i) => ({ points: path, color: look.color, dashed: i > 0 }));
     // the camera leaves the second robot where it has ended, and both others where somebody drives
     const watched = robots.slice(0, this.driver || this.robots[1].ended ? 1 : 2).map(({ x }) => x);
@@ -207,10 +212,15 @@ class Playground extends Page {
   }
 
   /** How much more than the optimum an undisturbed robot has cost so far, or in all once its episode is over.
-   * Who drives is told the least regret that is still possible: what it has cost already, over the whole optimum. */
+   * While somebody drives, it is that of the whole episode if the policy takes over now; where the policy fails from here on, the
+   * least that is still possible is shown, which is that of the cost so far. It is never negative. */
   regret(robot) {
     if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
-    if (this.driver && !robot.over) return `at least ${Math.max(0, 100 * (robot.cost / this.scenario.optimum - 1)).toFixed(0)} %`;
+    if (this.driver && !robot.over) {
+      const forecast = robot === this.robots[0] ? this.forecast.cost : null;
+      const least = Math.max(0, 100 * ((forecast ?? robot.cost) / this.scenario.optimum - 1));
+      return `${forecast === null ? "at least" : "about"} ${least.toFixed(0)} %`;
+    }
     const share = 100 * (robot.cost / (robot.over ? this.scenario.optimum : this.best.cost) - 1);
     // nothing costs less than the optimum over a whole episode
     return robot.over ? `regret ${Math.max(0, share).toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
