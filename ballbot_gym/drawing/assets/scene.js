@@ -280,7 +280,7 @@ class Scene {
     this.put(this.cylinder, framed(...sides, low), [...rgb(color), alpha]);
     if (robot.wheel_radius) this.drawWheels(ball, axes, yaw, [...rgb(colors.ball), alpha]);
     if (this.isShadow) return;
-    if (u && Math.hypot(...u) > least_force) this.drawArrow(ball, Vector.times([...u, 0], force_scale), colors.force, alpha);
+    if (u?.length === 2 && Math.hypot(...u) > least_force) this.drawArrow(ball, Vector.times([...u, 0], force_scale), colors.force, alpha);
     if (push) this.drawArrow(body, Vector.times([...push, 0], push_scale), colors.push, alpha);
     if (goal) this.drawGoal(x, goal, colors.goal);
   }

@@ -106,6 +106,6 @@ def _take_data(take: Take) -> dict[str, object]:
         "label": take.label,
         "color": take.color,
         "note": take.note,
-        "x": x[:, :4].round(4).tolist(),
+        "x": np.hstack([x[:, :4], x[:, 8:9]]).round(4).tolist(),  # with the heading of a robot with wheels
         "u": u.round().astype(int).tolist(),
     }

@@ -263,10 +263,7 @@ class Playground:
         main, robots, paths, colors = self.main, [], [], self.colors
         for i, runner in reversed(list(enumerate(self.runners))):
             alpha = GHOST_OPACITY if i else 1.0
-            drawn = (
-                runner is main and not main.violated and len(main.force) == 2
-            )  # those of wheels have no one direction
-            force = np.array(runner.force) if drawn else None
+            force = np.array(runner.force) if runner is main and not main.violated else None
             said = failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
             label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
             robots.append(Robot(np.array(runner.x), colors[i], force, alpha, push, label))

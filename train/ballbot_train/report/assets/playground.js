@@ -216,10 +216,10 @@ class Playground extends Page {
    * least that is still possible is shown, which is that of the cost so far. It is never negative. */
   regret(robot) {
     if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
-    if (this.driver && !robot.over) {
-      const forecast = robot === this.robots[0] ? this.forecast.cost : null;
-      const least = Math.max(0, 100 * ((forecast ?? robot.cost) / this.scenario.optimum - 1));
-      return `${forecast === null ? "at least" : "about"} ${least.toFixed(0)} %`;
+    if (this.driver && robot === this.robots[0] && !robot.over) {
+      const { cost } = this.forecast;
+      const least = Math.max(0, 100 * ((cost ?? robot.cost) / this.scenario.optimum - 1));
+      return `${cost === null ? "at least" : "about"} ${least.toFixed(0)} %`;
     }
     const share = 100 * (robot.cost / (robot.over ? this.scenario.optimum : this.best.cost) - 1);
     // nothing costs less than the optimum over a whole episode
