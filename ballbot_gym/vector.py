@@ -19,11 +19,11 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
+from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.sensors import observation_space
