@@ -18,7 +18,7 @@ from pathlib import Path
 
 _log = logging.getLogger(__name__)
 _WINDOWS = sys.platform == "win32"
-_SUFFIX = ".dll" if _WINDOWS else ".so"
+SUFFIX = ".dll" if _WINDOWS else ".so"
 _FLAGS = ("-shared",) if _WINDOWS else ("-fPIC", "-shared")
 _NATIVE = "-march=native"  # some compilers do not know it for some processors, such as clang for ARM
 _LIBRARIES = () if _WINDOWS else ("-lm",)
@@ -31,7 +31,6 @@ SHIPPED = Path(__file__).with_name("compiled")
 """The libraries that a wheel contains, in a folder for each of `LEVELS`."""
 
 LEVELS = {
-    "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"),
     "x86-64-v3": ("avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"),
     "x86-64": (),
     "arm64": (),
@@ -134,7 +133,7 @@ def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str
     """Compiles into a folder of its own, then renames: two processes at once, or a kill, never leave half a library."""
     # inside the cache, because a rename is atomic within one file system only
     with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
-        built = Path(scratch) / f"code{_SUFFIX}"
+        built = Path(scratch) / f"code{SUFFIX}"
         try:
             compile_library(compiler, source, built, (*flags, _NATIVE))
         except subprocess.CalledProcessError:
@@ -165,7 +164,7 @@ def kept(built: Path, folder: Path, stem: str) -> Path:
 
     A digest inside of the file would break its signature, which macOS asks for.
     """
-    path = folder / f"{stem}-{_digest(built)}{_SUFFIX}"
+    path = folder / f"{stem}-{_digest(built)}{SUFFIX}"
     try:
         built.replace(path)
     except PermissionError:  # Windows replaces no library that is in use
@@ -204,7 +203,7 @@ def _whole(folder: Path, stem: str, own: bool) -> Path | None:
         stem: its name without the digest of its content.
         own: whether it must be this user's own. A folder that others could once write into may still hold their files.
     """
-    return next((path for path in sorted(folder.glob(f"{stem}-*{_SUFFIX}")) if _is_whole(path, own)), None)
+    return next((path for path in sorted(folder.glob(f"{stem}-*{SUFFIX}")) if _is_whole(path, own)), None)
 
 
 def _is_whole(path: Path, own: bool) -> bool:

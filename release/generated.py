@@ -5,6 +5,7 @@
 The libraries are compiled too, into the user's cache, because optima and experts need them to run.
 """
 
+import itertools
 import json
 import sys
 from collections.abc import Iterator
@@ -15,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
-from ballbot_gym import BallbotEnv, BallbotVectorEnv, machine_code, rollout
+from ballbot_gym import BallbotEnv, BallbotVectorEnv, codegen, machine_code, native, rollout
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robots import PAPER, ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 
@@ -62,11 +63,12 @@ def recorded() -> Iterator[list[Code]]:
 
 
 def environments(task: str, robot: str) -> None:
-    """Runs a single environment and vector environments in both precisions."""
+    """Runs a single environment and vector environments, those of the paper's robot in both precisions."""
     env = BallbotEnv(task, physics="rk4", robot=robot)
-    env.reset(seed=0)
-    env.step(np.zeros(env.params.action_size))
-    for dtype in ("float32", "float64"):
+    for seed in range(2):  # machine code comes with the second episode
+        env.reset(seed=seed)
+        env.step(np.zeros(env.params.action_size))
+    for dtype in ("float32", "float64") if robot == PAPER else ("float32",):
         envs = BallbotVectorEnv(2, task, robot=robot, dtype=dtype, engine="native")
         envs.reset(seed=0)
         envs.step(np.zeros((2, envs.params.action_size), np.float32))
@@ -112,6 +114,15 @@ def write(codes: Iterator[Code], folder: Path) -> None:
     (folder / "codes.json").write_text(json.dumps(listed, indent=1), encoding="utf-8")
 
 
+def write_sources(folder: Path) -> None:
+    """Writes the code of vector environments under the names by which they find it where CasADi is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for robot, task, double in itertools.product(ROBOTS, TASKS, (False, True)):
+        made, params = make_task(task, robot), ROBOTS[robot].params
+        source = codegen.source(made, params, double)
+        (folder / f"{native.code_name(made, params, double)}.c").write_text(source, encoding="utf-8")
+
+
 def read(folder: Path) -> list[Code]:
     """The code that `write` wrote."""
     listed = json.loads((folder / "codes.json").read_text(encoding="utf-8"))
@@ -121,4 +132,5 @@ def read(folder: Path) -> list[Code]:
 
 
 if __name__ == "__main__":
+    write_sources(Path(sys.argv[1]) / "source")
     write(generated(), Path(sys.argv[1]))
