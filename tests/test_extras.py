@@ -16,7 +16,7 @@ def run(code, *blocked):
 
 
 MISSING = [  # in an order in which nothing imports what is missing later
-    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
+    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0', compile=True)", "torch", "train"),
     (
         "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
         *("scipy", "baselines"),
