@@ -10,14 +10,28 @@ from typing import TYPE_CHECKING
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.lazy import exports
-from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.paths import catmull_rom, cubic, then_stay
-from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import load_plugins, register_task
-from ballbot_gym.robots import named_robot, register_robot
+from ballbot_gym.robot import (
+    Ballbot,
+    Cylinder,
+    Omni,
+    PointBall,
+    Quantity,
+    Randomization,
+    Robot,
+    RollingBall,
+    Shape,
+    Sphere,
+    Wheels,
+    default_params,
+    named_robot,
+    read_urdf,
+    register_robot,
+)
 from ballbot_gym.rollout import Controller, Episode, rollout
 from ballbot_gym.seeding import spawned
-from ballbot_gym.tasks import SHIPPED, TASKS, Reference, Task
+from ballbot_gym.tasks import SHIPPED, TASKS, BallbotTask, Reference, Task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -31,26 +45,37 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TASKS",
+    "Ballbot",
     "BallbotBatch",
     "BallbotEnv",
-    "BallbotParams",
+    "BallbotTask",
     "BallbotVectorEnv",
     "Controller",
+    "Cylinder",
     "Episode",
     "Marker",
+    "Omni",
     "Orbit",
+    "PointBall",
+    "Quantity",
     "Randomization",
     "Reference",
+    "Robot",
+    "RollingBall",
+    "Shape",
+    "Sphere",
     "Stabilize",
     "Task",
     "Trajectory",
     "Turn",
     "Weave",
+    "Wheels",
     "catmull_rom",
     "cubic",
     "default_params",
     "named_robot",
     "ops",
+    "read_urdf",
     "register_robot",
     "register_task",
     "rollout",

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import counter_rng, dynamics, ops
+from ballbot_gym import counter_rng, ops
 from ballbot_gym.native import FLAG_ROWS, BallbotNative, Computed, State
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import outcome
 
 _REWARD, _COST, _SURVIVE, _RUNNING, _GOAL = range(5)  # rows of what is paid
 _TERMINATED, _TRUNCATED, _SUCCESS, _FAILURE, _CLIPPED, _DONE = range(FLAG_ROWS)
@@ -24,7 +24,7 @@ class BallbotArrays(BallbotNative):
 
     compiled = False
 
-    def __init__(self, task: Task, num_envs: int, dtype: type[np.floating], params: BallbotParams):
+    def __init__(self, task: Task, num_envs: int, dtype: type[np.floating], params: Robot):
         """Makes the envs; arguments as of `BallbotNative`.
 
         Raises:
@@ -54,21 +54,16 @@ class BallbotArrays(BallbotNative):
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         x = tuple(state.x)
         now = self.task.at(tuple(state.c), state.steps.astype(self.dtype) * self.dtype(self.task.control_dt))
-        seen = self._rows(ops.components(self.task.seen(x, now)), state.x.shape[1])
-        return seen, self._rows((dynamics.tilt(x),), state.x.shape[1])[0]
+        seen = self._rows(ops.components(self.task.seen(x, now, self.params)), state.x.shape[1])
+        return seen, self._rows(self.params.measurements(x), state.x.shape[1])
 
     def _advanced(self, old: State, actions: np.ndarray) -> tuple[np.ndarray, ...]:
         """One control step: rows of states, tilts, forces and grip; pay; flags; and violated limits."""
         task, params, size = self.task, self.params, self.num_envs
         x, c, a = tuple(old.x), tuple(old.c), tuple(actions.T)
         u = tuple(ops.clip(part, -1.0, 1.0) * params.force_limit for part in a)
-        end = dynamics.step(params, x, u, task.control_dt, dynamics.substeps_for(task.control_dt))
-        grip, held = (), ()
-        if params.grips:
-            floor = dynamics.held_contact(params, x, u, task.control_dt)
-            limits = [part for force in floor for part in dynamics.grip_limits(params, force)]
-            held = (np.minimum.reduce(np.broadcast_arrays(*limits)),)
-            grip = (*floor[0], np.maximum(*(dynamics.needed_friction(force) for force in floor)))
+        end = params.step(x, u, task.control_dt, substeps_for(task.control_dt))
+        grip, held = params.held(x, u, task.control_dt)
         did = outcome(task, x, u, end, c, (old.steps + 1).astype(self.dtype), held)
         survive = task.survival_reward * task.control_dt
         reward = survive - did.running + did.goal
@@ -83,7 +78,7 @@ class BallbotArrays(BallbotNative):
             row[:] = np.asarray(part) != 0
         flags[_TRUNCATED] |= ~flags[_TERMINATED] & (old.steps + 1 >= self.most_steps)
         flags[_DONE] = flags[_TERMINATED] | flags[_TRUNCATED]
-        rows = self._rows((*end, dynamics.tilt(end), *u, *grip), size)
+        rows = self._rows((*end, *params.measurements(end), *u, *grip), size)
         return rows, pay, flags, np.asarray(did.violated, np.int64)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
@@ -108,13 +103,14 @@ class BallbotArrays(BallbotNative):
             violated[waiting] = -1
         begun = np.flatnonzero(begins)
         if begun.size:
-            tilt = self.params.state_size
-            rows[tilt + 1 : self._told_rows, begun] = 0
+            states = self.params.state_size
+            measured = states + len(self.params.MEASUREMENTS)
+            rows[measured : self._told_rows, begun] = 0
             steps[begun], episode[begun] = 0, episode[begun] + 1
             x, c[:, begun] = self._drawn(old.seed[begun], episode[begun], None)
-            rows[:tilt, begun] = x
+            rows[:states, begun] = x
             started = old._replace(x=x, c=c[:, begun], steps=steps[begun])
-            seen[:, begun], rows[tilt, begun] = self._seen(started)
+            seen[:, begun], rows[states:measured, begun] = self._seen(started)
         return (rows, seen, pay, flags, np.array((violated, steps, episode)), c, last), not finite
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -42,15 +42,13 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
     """
     import torch  # there is a batch, so it is there
 
-    from ballbot_gym.batch import tilt_of
-
     check_finite(actions)
     actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
     before: Any = batch.state
     with torch.no_grad():
         result: Any = _advance(batch, torch.from_numpy(actions).to(batch.device), waiting)
         state: Any = batch.state
-        tilt, last_tilt = (as_array(tilt_of(x.unbind(0))) for x in (state.x, result.final_x))
+        measured, last_measured = map(batch.measurements, (state, state._replace(x=result.final_x)))
     result = result._make(map(as_array, result))
     reward, cost = (part.astype(np.float64, copy=False) for part in (result.reward, result.cost))
     ended = (result.terminated | result.truncated).nonzero()[0]
@@ -68,9 +66,9 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
     violated, end = result.violated, None
     now = cost, parts, result.force, result.success, violated >= 0, result.clipped, result.grip
     if batch.restarts and ended.size:
-        end = info_of(before._replace(x=result.final_x), last_tilt, violated, *now)
+        end = info_of(before._replace(x=result.final_x), last_measured, violated, *now)
         now = tuple(_without(part, ended) for part in now)
-    info = info_of(state, tilt, violated, *now)
+    info = info_of(state, measured, violated, *now)
     return told(seen, reward, result.terminated, result.truncated, info, end, last[ended])
 
 
@@ -125,7 +123,7 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
 
 def info_of(
     state: Any,
-    tilt: np.ndarray,
+    measured: dict[str, np.ndarray],
     violated: np.ndarray,
     cost: np.ndarray,
     reward_parts: np.ndarray,
@@ -139,7 +137,7 @@ def info_of(
 
     Args:
         state: a `BatchState` with what is told of states, constants and draws, whatever its arrays are.
-        tilt: (B,) rad.
+        measured: (B,) what the robot measures, by name.
         violated: (B,) int64, as of `BatchStep`, where `failure` holds.
         cost: (B,) float64, of the step.
         reward_parts: (3, B) float64, which add up to the reward.
@@ -158,7 +156,7 @@ def info_of(
         "reward_survive": reward_parts[0],
         "reward_cost": reward_parts[1],
         "reward_goal": reward_parts[2],
-        "tilt": tilt,
+        **measured,
         "success": success,
         "is_success": success,
         "failure": failure,

@@ -18,17 +18,22 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from ballbot_gym import counter_rng, dynamics, sensors
+from ballbot_gym import counter_rng
 from ballbot_gym.batch_state import BatchState, check_starts
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
-from ballbot_gym.env import make_task
+from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, checked_robot
+from ballbot_gym.robot import (
+    PAPER,
+    Randomization,
+    Robot,
+    checked_randomization,
+    sensors,
+    substeps_for,
+)
 from ballbot_gym.seeding import seeds_of
+from ballbot_gym.step import check_observation, limit_names, outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import limit_names, outcome
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -111,9 +116,9 @@ class BallbotBatch:
         device: str | torch.device = "cpu",
         dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
-        params: BallbotParams | None = None,
+        params: Robot | None = None,
         randomization: Randomization | str | None = None,
-        robot: str | BallbotParams = PAPER,
+        robot: str | Robot = PAPER,
         history: int = 0,
         observation: str = "state",
         **task_fields: Any,
@@ -128,9 +133,9 @@ class BallbotBatch:
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
                 warning and runs eagerly. False never compiles. Of robots with wheels the equations of motion alone are
                 compiled: all of their `transition` would take many minutes.
-            params: the nominal robot as a BallbotParams; the same as robot.
+            params: the nominal robot as a Robot; the same as robot.
             randomization: what varies, or a name in `TRACKS`; default, nothing.
-            robot: a name in `ROBOTS`, or a BallbotParams.
+            robot: a name in `ROBOTS`, or a Robot.
             history, observation: as of `BallbotEnv`.
             **task_fields: fields of the task that replace its defaults.
 
@@ -144,23 +149,23 @@ class BallbotBatch:
             raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
         if compile not in (True, False, "auto"):
             raise ValueError(f'compile must be True, False or "auto", not {compile!r}')
-        self.params = checked_robot(robot, params)
+        self.params = robot_of(task, robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.limit_names = limit_names(self.task, self.params)
         self.randomization, self.history = checked_randomization(randomization, self.params), check_history(history)
-        self.observation = sensors.check_observation(observation, self.params, self.randomization)
+        self.observation = check_observation(observation, self.params, self.randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
         self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
         self.restarts = True  # else envs stay at the ends of their episodes
-        self._substeps = dynamics.substeps_for(self.task.control_dt)
+        self._substeps = substeps_for(self.task.control_dt)
         self.randomization.delay_steps(self.task.control_dt)  # raises an error where it is no whole number of these
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._compile = compile
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
-        wheels = self.params.wheels is not None
-        self._run = _compiled(self._transition) if wanted and not wheels else self._transition
-        self._slope = self._compiled_slope() if wanted and wheels and not self.randomization.varies_robot else None
+        long = self.params.LONG_EQUATIONS
+        self._run = _compiled(self._transition) if wanted and not long else self._transition
+        self._slope = self._compiled_slope() if wanted and long and not self.randomization.varies_robot else None
         self._proven = not wanted
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -261,10 +266,6 @@ class BallbotBatch:
         """(B, no) observations of a state, with the sensors' noise. A pure function."""
         return self._observe(_rows(state))
 
-    def tilt(self, state: BatchState) -> torch.Tensor:
-        """(B,) tilt, rad, of a state; see `tilt_of`."""
-        return tilt_of(state.x.unbind(0))
-
     def sensed(self, state: BatchState) -> torch.Tensor:
         """(8, B) states as sensors report them, with the noise that `observe` shows. A pure function."""
         return torch.stack(self._sensed(_rows(state)))
@@ -325,11 +326,8 @@ class BallbotBatch:
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
         if self.params.grips:
             with torch.no_grad():  # it decides what ends an episode, and nothing else
-                at_begin, at_end = dynamics.held_contact(robot, x, total, task.control_dt)
-                first, second = (torch.minimum(*dynamics.grip_limits(robot, part)) for part in (at_begin, at_end))
-                kept = (torch.minimum(first, second),)
-                needed = torch.maximum(dynamics.needed_friction(at_begin), dynamics.needed_friction(at_end))
-                grip = torch.stack((*at_begin, needed))
+                held, kept = robot.held(x, total, task.control_dt)
+                grip = torch.stack(held)
         steps = state.steps + 1
         did = outcome(task, x, force, end, c, steps.to(self.dtype), kept)
         truncated = did.truncated
@@ -376,21 +374,27 @@ class BallbotBatch:
         """The states after a control step."""
         dt, slope = self.task.control_dt, self._slope
         if slope is None:
-            return dynamics.step(robot, x, force, dt, self._substeps)
+            return robot.step(x, force, dt, self._substeps)
         rows = (torch.stack(x),), (torch.stack(force),)
-        (end,) = dynamics.step(robot, *rows, dt, self._substeps, lambda _, x, u: (slope(*x, *u),))
+        (end,) = robot.step(*rows, dt, self._substeps, lambda x, u: (slope(*x, *u),))
         return end.unbind(0)
 
     def _compiled_slope(self) -> Any:
-        """`dynamics.derivative` of states (n, B) and forces (m, B), compiled."""
+        """`Robot.derivative` of states (n, B) and forces (m, B), compiled."""
         params = self.params
 
         def slope(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-            return torch.stack(dynamics.derivative(params, x.unbind(0), u.unbind(0)))
+            return torch.stack(params.derivative(x.unbind(0), u.unbind(0)))
 
         return torch.compile(slope, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
-    def model(self, drawn: tuple[torch.Tensor, ...]) -> BallbotParams:
+    def measurements(self, state: BatchState) -> dict[str, np.ndarray]:
+        """(B,) what the robot measures in a state, by name. It carries no gradient."""
+        with torch.no_grad():
+            values = self.params.measurements(state.x.detach().unbind(0))
+        return self.params.named_measurements(value.cpu().numpy() for value in values)
+
+    def model(self, drawn: tuple[torch.Tensor, ...]) -> Robot:
         """The robots for whose episodes the randomization drew this, (B,) each, as one whose numbers are (B,)."""
         return self.randomization.robot(self.params, drawn) if self.randomization.varies_robot else self.params
 
@@ -433,7 +437,7 @@ class BallbotBatch:
         c = now.c
         if self.task.clock:
             c = self.task.at(c, now.steps.to(self.dtype) * self.task.control_dt)
-        return sensors.seen(now.sensors, c) if now.sensors else tuple(self.task.seen(self._sensed(now), c))
+        return sensors.seen(now.sensors, c) if now.sensors else tuple(self.task.seen(self._sensed(now), c, self.params))
 
     def _sensed(self, now: _Rows) -> tuple[torch.Tensor, ...]:
         if not self.randomization.is_noisy:
@@ -489,11 +493,6 @@ def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
         return a if a is b else torch.where(mask, a, b)
 
     return BatchState(*map(chosen, new, old))
-
-
-def tilt_of(x: tuple) -> torch.Tensor:
-    """(B,) tilt, rad, of states in 8 rows. It carries no gradient, because that is infinite where a robot is upright."""
-    return dynamics.tilt(tuple(part.detach() for part in x))
 
 
 def _described(value: Any) -> str:

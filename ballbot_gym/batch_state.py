@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ballbot_gym.step import first_violated
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import first_violated
 
 if TYPE_CHECKING:
     import torch
@@ -15,7 +15,7 @@ class BatchState(NamedTuple):
     """Everything that a batch of B environments remembers."""
 
     x: torch.Tensor
-    """(8, B) states; order and units in `dynamics.STATE`; with wheels (11, B), in `dynamics.OMNI_STATE`."""
+    """(8, B) states; order and units in `Ballbot.STATE`; with wheels (11, B), in `Ballbot.OMNI_STATE`."""
     c: torch.Tensor
     """(nc, B) constants of the running episodes."""
     steps: torch.Tensor

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ballbot_gym import dynamics, ops
+from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import outcome
 
 with imports_of("the machine code of batches", "baselines"):
     import casadi
@@ -67,7 +67,7 @@ _LOGIC = {
 _TRUTH = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, *_LOGIC}
 
 
-def source(task: Task, params: BallbotParams, double: bool) -> str:
+def source(task: Task, params: Robot, double: bool) -> str:
     """The C code of a task and a robot, with the functions `step`, `ballbot_start` and `ballbot_observe` of native.c.
 
     Args:
@@ -90,7 +90,7 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         block(
             "look",
             (("x", x), ("c", c), ("t", taken)),
-            (("seen", ops.components(task.seen(x, now))), ("tilt", (dynamics.tilt(x),))),
+            (("seen", ops.components(task.seen(x, now, params))), ("measured", params.measurements(x))),
         ),
         block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
         block("draw_state", (("z", z[1]), ("c", c)), (("x", task.start(z[1], c, params)),)),
@@ -102,6 +102,7 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         "STATES": len(x),
         "ACTIONS": len(action),
         "SEEN": task.observation_size(params),
+        "MEASURED": len(params.MEASUREMENTS),
         "GRIP": 4 if params.grips else 0,
         "FLAGS": len(FLAGS),
         "SURVIVAL_REWARD": float(task.survival_reward * task.control_dt),  # per step
@@ -172,17 +173,12 @@ def text(name: str) -> str:
 
 
 def _advance(
-    task: Task, params: BallbotParams, x: tuple, c: tuple, action: tuple, taken: Any
+    task: Task, params: Robot, x: tuple, c: tuple, action: tuple, taken: Any
 ) -> tuple[tuple[str, Sequence[Any]], ...]:
     """One control step, as `BallbotBatch.transition` computes it, up to the start of the next episode."""
     u = tuple([casadi.fmax(casadi.fmin(part, 1.0), -1.0) * params.force_limit for part in action])
-    end = dynamics.step(params, x, u, task.control_dt, dynamics.substeps_for(task.control_dt))
-    grip, kept = (), ()
-    if params.grips:
-        floor = dynamics.held_contact(params, x, u, task.control_dt)
-        held = [casadi.fmin(*dynamics.grip_limits(params, force)) for force in floor]
-        kept = (casadi.fmin(*held),)
-        grip = (*floor[0], casadi.fmax(*(dynamics.needed_friction(force) for force in floor)))
+    end = params.step(x, u, task.control_dt, substeps_for(task.control_dt))
+    grip, kept = params.held(x, u, task.control_dt)
     did = outcome(task, x, u, end, c, taken + 1, kept)
     reward = task.survival_reward * task.control_dt - did.running + did.goal
     clipped = casadi.fabs(action[0]) > 1

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ballbot_gym import lazy
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 
 if TYPE_CHECKING:
     from ballbot_gym.trajectory import Trajectory
@@ -36,7 +36,7 @@ class Moving(Displayed):
         """The motion that is shown."""
         return getattr(self, "trajectory")  # noqa: B009 (a field of the subclasses)
 
-    def show(self, *others: Moving, labels: Sequence[str] = (), robot: str | BallbotParams = "paper") -> Path | None:
+    def show(self, *others: Moving, labels: Sequence[str] = (), robot: str | Robot = "paper") -> Path | None:
         """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.
 
         Args:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym import dynamics, sensors, step_code
+from ballbot_gym import step_code
 from ballbot_gym.checks import (
     check_constant_names,
     check_history,
@@ -20,17 +20,25 @@ from ballbot_gym.checks import (
     real_array,
     reset_options,
 )
-from ballbot_gym.drawing import Drawing, Robot
+from ballbot_gym.drawing import Drawing, Drawn
 from ballbot_gym.drawing.picture import picture
 from ballbot_gym.drawing.viewer import Viewer, can_show, need_library
 from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
-from ballbot_gym.robots import PAPER, checked_robot, own_fields
+from ballbot_gym.robot import (
+    PAPER,
+    Randomization,
+    Robot,
+    checked_randomization,
+    checked_robot,
+    named_robot,
+    needed_friction,
+    own_fields,
+    sensors,
+)
+from ballbot_gym.step import ENGINE, Outcome, check_observation, limit_names, observation_space, outcome
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.transition import ENGINE, Outcome, limit_names, outcome
 
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _NOTHING_DONE = Outcome(0.0, -0.0, *(0.0,) * 5, violated=-1.0)  # whose reward_cost is 0.0
@@ -42,7 +50,7 @@ class EnvState(NamedTuple):
 
     task: Task
     x: State
-    """(8,) state; order and units in `dynamics.STATE`, or (11,) as `dynamics.OMNI_STATE`."""
+    """(8,) state; order and units in `Ballbot.STATE`, or (11,) as `Omni.STATE`."""
     constants: State
     """(nc,) constants of the episode."""
     steps_left: int
@@ -65,7 +73,7 @@ class TaskEnv:
     """What single and vector environments of a task share."""
 
     task: Task
-    params: BallbotParams
+    params: Robot
     randomization: Randomization
     closed = False
     most_steps: int | None = None
@@ -104,7 +112,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
 
     | key | meaning |
     |---|---|
-    | state | (8,) float64 state x; order and units in `dynamics.STATE`; with wheels (11,), in `dynamics.OMNI_STATE` |
+    | state | (8,) float64 state x; order and units in `Ballbot.STATE`; with wheels (11,), in `Omni.STATE` |
     | cost | what this step cost, a failure's price included (0 after `reset`): the objective, and no constraint's cost |
     | reward_survive | part of the reward: survival_reward · control_dt |
     | reward_cost | part of the reward: −cost rate · control_dt |
@@ -143,10 +151,10 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         task: str | Task = "stabilize",
         physics: str | None = None,
         render_mode: str | None = None,
-        params: BallbotParams | None = None,
+        params: Robot | None = None,
         physics_dt: float | None = None,
         randomization: Randomization | str | None = None,
-        robot: str | BallbotParams = PAPER,
+        robot: str | Robot = PAPER,
         history: int = 0,
         observation: str = "state",
         **task_fields: Any,
@@ -158,16 +166,16 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             physics: "bullet" or "pybullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the
                 closed-form model. Default, for every id too, the first that is installed; "rk4" comes with a warning.
             render_mode: None; "rgb_array", which needs no display; or "human": a page in the browser, in real time.
-            params: the robot as a BallbotParams; the same as robot.
+            params: the robot as a Robot; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
             randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF,
                 which takes 2 ms and 5 kB of memory that PyBullet never frees.
-            robot: a name in `ROBOTS`, such as "paper", "rolling", "kugle" or "omni", or a BallbotParams. Tasks draw other
+            robot: a name in `ROBOTS`, such as "paper", "rolling", "kugle" or "omni", or a Robot. Tasks draw other
                 episodes for some.
             history: so many earlier observations follow the present one in each observation, the latest first, each with the
                 action (2) that was taken on it. Before the episode began they are the first one, with the action 0.
-            observation: "state"; or "sensors" of a robot with wheels, as `ballbot_gym.sensors` says.
+            observation: "state"; or "sensors" of a robot with wheels, as `ballbot_gym.robot.sensors` says.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -178,8 +186,8 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         """
         self._page: Viewer | None = None
         self._state: State = ()  # until the first reset
-        self.params = checked_robot(robot, params)
-        physics = checked_physics(physics)
+        self.params = robot_of(task, robot, params)
+        physics = checked_physics(physics, self.params)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         if render_mode == "human":
@@ -195,11 +203,11 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._drawn: State = ()
         self._resting = self.randomization.resting((0.0,) * self.params.action_size, self.task.control_dt)
         self._actuator = self._resting
-        self.observation = sensors.check_observation(observation, self.params, self.randomization)
+        self.observation = check_observation(observation, self.params, self.randomization)
         self._sensors: tuple[float, ...] = ()
         self._noisy = self.randomization.is_noisy or self.observation == "sensors"
         self.history = check_history(history)
-        self.observation_space = sensors.observation_space(self.task, self.params, self.history, self.observation)
+        self.observation_space = observation_space(self.task, self.params, self.history, self.observation)
         self._past = self._tried = np.zeros(0)  # the last observation with a history, and the action on it
         self._physics_dt, self._may_lose = physics_dt, physics != "rk4"
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
@@ -235,7 +243,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         x, c = self._draw(state, constants)
         self._resets += 1
         self._use_code()
-        judge, tilt = self._start(x, c)
+        judge, measured = self._start(x, c)
         self._set_constants(c)
         self._state = x
         if self._random:
@@ -251,7 +259,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._steps_left, self._taken = self._steps, 0
         if self._human:
             self.render()
-        return self._shown(judge, (*_NOTHING_DONE, tilt), 0.0, (0.0,) * self.params.action_size)
+        return self._shown(judge, (*_NOTHING_DONE, *measured), 0.0, (0.0,) * self.params.action_size)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -293,15 +301,15 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._steps_left -= 1
         grip, kept = _NO_GRIP, 0.0
         if self._grips and not lost:
-            grip, slips = self._grip(before, total)
-            kept = -1.0 if slips else 0.0
+            grip, kept = self._grip(before, total)
         self._taken = steps = self._steps - self._steps_left
         judge = self._judge
         did = None if judge is None or lost else judge.judge(before, force, x, steps, kept)
         if did is None:
             judge = None
             end = outcome(self.task, before, force, x, self._constants, steps, (-1.0 if lost else kept,))
-            did = *(end._replace(violated=len(self.limit_names) - 1) if lost else end), dynamics.tilt(x)
+            end = end._replace(violated=len(self.limit_names) - 1) if lost else end
+            did = *end, *self.params.measurements(x)
         terminated = did[3] > 0
         if terminated:
             self._steps_left = 0
@@ -316,7 +324,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         return (*names, ENGINE) if self._may_lose else names
 
     @property
-    def episode_params(self) -> BallbotParams:
+    def episode_params(self) -> Robot:
         """The robot of the running episode: `params`, unless randomized."""
         return self._robot
 
@@ -335,7 +343,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if not self._state:
             raise gymnasium.error.ResetNeeded("render() before reset()")
         markers = tuple(self.task.markers(self._constants_array))
-        drawing = Drawing(self.params, (Robot(np.array(self._state)),), markers=markers)
+        drawing = Drawing(self.params, (Drawn(np.array(self._state)),), markers=markers)
         if self.render_mode == "rgb_array":
             return picture(drawing)
         if self._page is None:
@@ -436,33 +444,32 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             self._simulator.set_params(self._robot)
         self._simulator.reset(self._state, memory)
 
-    def _grip(self, x: State, total: tuple[float, ...]) -> tuple[tuple[float, ...], bool]:
-        """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
+    def _grip(self, x: State, total: tuple[float, ...]) -> tuple[tuple[float, ...], float]:
+        """What `info` reports as "grip" of a step from state x, and a limit that is ≥ 0 if the robot kept its grip."""
         simulated = self._simulator.floor_force()
         if simulated is not None:
-            return (*simulated, dynamics.needed_friction(simulated)), False
-        robot = self.episode_params
-        asked = dynamics.held_contact(robot, x, total, self.task.control_dt)
-        needed = max(map(dynamics.needed_friction, asked))
-        return (*asked[0], needed), not dynamics.keeps_grip(robot, asked)
+            return (*simulated, needed_friction(simulated)), 0.0
+        grip, limits = self.episode_params.held(x, total, self.task.control_dt)
+        return grip, min(limits)
 
-    def _start(self, x: State, c: State) -> tuple[step_code.Judge | None, float]:
-        """Who judged a start, if machine code did, and its tilt, rad. Raises a ValueError if it is out of range."""
+    def _start(self, x: State, c: State) -> tuple[step_code.Judge | None, State]:
+        """Who judged a start, if machine code did, and its measurements. Raises a ValueError if it is out of range."""
         if self._judge is not None:
             self._judge.c[:] = c
             did = self._judge.judge(x, (0.0,) * self.params.action_size, x, 0, 0.0)
             if did is not None and did[7] < 0:
-                return self._judge, did[8]
+                return self._judge, did[8:]
             if self._state:  # its episode goes on where this one cannot start
                 self._judge.c[:] = self._constants
         task = self.task
         if violated := task.violated(x, task.at(c, 0.0)):
-            values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.OMNI_STATE, x, strict=False))
+            values = [f"{quantity.name} = {value:g}" for quantity, value in zip(self.params.STATE, x, strict=True)]
+            measured = zip(self.params.MEASUREMENTS, self.params.measurements(x), strict=True)
+            values += [f"{quantity.name} = {value:g} {quantity.unit}" for quantity, value in measured]
             raise ValueError(
-                f"{task.id}: the start state is out of range: it violates the limit of {violated} ({values}; "
-                f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
+                f"{task.id}: the start state is out of range: it violates the limit of {violated} ({', '.join(values)})"
             )
-        return None, dynamics.tilt(x)
+        return None, self.params.measurements(x)
 
     def _draw(self, state: Any, constants: Any) -> tuple[State, State]:
         """Initial state and constants. Those that are not given are drawn."""
@@ -497,7 +504,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if self._noisy:
             z = tuple(self.np_random.random(Randomization.NOISE_DRAWS).tolist())
             x = self.randomization.sensed(x, z, self._drawn, self._taken * self.task.control_dt)
-        return self.task.seen(x, c)
+        return self.task.seen(x, c, self.params)
 
     def _shown(
         self,
@@ -508,7 +515,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         clipped: bool = False,
         grip: tuple[float, ...] = _NO_GRIP,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Observation and `info` of what a step did, an `Outcome` and a tilt; who judged it, unless Python did."""
+        """Observation and `info` of what a step did, an `Outcome` and measurements; who judged it, unless Python did."""
         seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
         if self._remembers:
             own, old = len(seen), self._past
@@ -518,7 +525,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
                 still = np.zeros(self.params.action_size, np.float32)
                 self._past = np.append(seen, np.tile(np.append(seen, still), self.history))
             seen = self._past.copy()
-        cost, running, goal, _, _, succeeded, failed, violated, tilt = did
+        cost, running, goal, _, _, succeeded, failed, violated, *measured = did
         success = succeeded > 0
         info = {
             "state": np.array(self._state) if judge is None else judge.x.copy(),
@@ -526,7 +533,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             "reward_survive": survive,
             "reward_cost": -running,
             "reward_goal": goal,
-            "tilt": tilt,
+            **self.params.named_measurements(measured),
             "success": success,
             "is_success": success,
             "failure": failed > 0,
@@ -543,12 +550,12 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         return seen, info
 
 
-def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fields: Any) -> Task:
+def make_task(task: str | Task, robot: str | Robot = PAPER, /, **task_fields: Any) -> Task:
     """The task named, with some fields replaced.
 
     Args:
         task: a name in `TASKS`, MODULE:NAME of one that a module registers, its id, or a Task.
-        robot: whose defaults the fields have: a name in `ROBOTS`, or a BallbotParams.
+        robot: whose defaults the fields have: a name in `ROBOTS`, or a Robot.
         **task_fields: fields that replace the defaults.
 
     Raises:
@@ -560,11 +567,25 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
             raise ValueError(f"fields {sorted(task_fields)} cannot be given together with a Task; use replace()")
         return task
     task = named_task(task)
+    own, given = named_robot(TASKS[task].ROBOT), checked_robot(robot)
+    family = [kind for kind in type(own).__mro__ if issubclass(kind, Robot)][-2]  # below Robot itself
+    if not isinstance(given, family):
+        raise ValueError(
+            f"{TASKS[task].id} is a task of a {family.__name__}, and the robot is a {type(given).__name__}; give robot="
+            f"{TASKS[task].ROBOT!r}"
+        )
     known = sorted(field.name for field in dataclasses.fields(TASKS[task]))
     for name in sorted(task_fields.keys() - set(known)):
         # Python's own words, because clients such as torchrl look for them.
         raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; it has {', '.join(known)}")
     return TASKS[task](**(own_fields(robot, task) | task_fields))
+
+
+def robot_of(task: str | Task, robot: Any = PAPER, params: Any = None) -> Robot:
+    """The robot that was given, see `checked_robot`; by default the one that the task names as its own."""
+    if params is None and isinstance(robot, str) and robot == PAPER:
+        robot = (type(task) if isinstance(task, Task) else TASKS[named_task(task)]).ROBOT
+    return checked_robot(robot, params)
 
 
 def _floats(vector: Sequence[Any] | np.ndarray) -> State:

@@ -8,13 +8,13 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import Robot, first_of_kind, named_robot
 from ballbot_gym.tasks import Task
 
 _PROBES = 8  # episodes at which a task is compared
@@ -30,19 +30,19 @@ def digest(*parts: Any) -> str:
 
 
 @np.errstate(all="ignore")  # far from every episode a task need not give numbers
-def observation_digest(task: Task, params: BallbotParams) -> str:
+def observation_digest(task: Task, params: Robot) -> str:
     """Digest of the observations of a task at fixed states and times, and at constants.
 
     Of the constants, some are fixed numbers, and some are drawn as the task draws them by default for a shipped robot. So
     robots and tasks with other episodes share a digest where they observe the same.
     """
     rng, names, usual = np.random.default_rng(2), len(task.constant_names), _with_default_fields(task)
-    robot = named_robot(PAPER if params.wheels is None else "omni")
+    robot = named_robot(first_of_kind(params) if params.OUTPUTS else task.ROBOT)
     digits = []
     for x, time in _anywhere(rng, params):
         drawn = usual.draw_constants(tuple(rng.random(task.constant_draws).tolist()), robot)
         for c in (rng.uniform(1.0, 2.0, names), np.array(drawn, np.float64)):
-            digits.append(_rounded(task.seen, x, np.asarray(task.at(c, time))))
+            digits.append(_rounded(partial(task.seen, params=params), x, np.asarray(task.at(c, time))))
     return digest(digits)
 
 
@@ -51,7 +51,7 @@ PARTS = ("robot", "fields", "episodes", "costs", "limits", "goal", "observations
 
 
 @np.errstate(all="ignore")
-def problem_parts(task: Task, params: BallbotParams) -> dict[str, str]:
+def problem_parts(task: Task, params: Robot) -> dict[str, str]:
     """Digests of a robot, and of a task's fields, episodes, costs, limits, goal and observations, by `PARTS`.
 
     Two tasks that share a name and differ in a cost have different digests, and so have two robots of one name.
@@ -61,12 +61,13 @@ def problem_parts(task: Task, params: BallbotParams) -> dict[str, str]:
         [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit],
         [[_digits(part) for part in task.sample(rng, params)] for _ in range(_PROBES)],
         [_rounded(task.cost, *probe) for probe in probes],
-        *([_rounded(of, x, c) for x, _, c in probes] for of in (task.limits, task.goal, task.seen)),
+        *([_rounded(of, x, c) for x, _, c in probes] for of in (task.limits, task.goal)),
+        [_rounded(partial(task.seen, params=params), x, c) for x, _, c in probes],
     )
-    return {name: digest(part) for name, part in zip(PARTS, (repr(params), *values), strict=True)}
+    return {name: digest(part) for name, part in zip(PARTS, (params.record(), *values), strict=True)}
 
 
-def problem_digest(task: Task, params: BallbotParams) -> str:
+def problem_digest(task: Task, params: Robot) -> str:
     """One digest of all parts of a problem."""
     return digest(problem_parts(task, params))
 
@@ -85,7 +86,7 @@ def changed_parts(held: Mapping[str, str], wanted: Mapping[str, str]) -> list[st
     return changed if first is None else [name for name in changed if name in (first, "fields")]
 
 
-def _probes(task: Task, params: BallbotParams) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _probes(task: Task, params: Robot) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Fixed states, forces, and constants as `Task.at` gives them: of drawn episodes, near their starts and anywhere."""
     rng = np.random.default_rng(1)
     starts = [task.sample(rng, params) for _ in range(_PROBES)]
@@ -95,7 +96,7 @@ def _probes(task: Task, params: BallbotParams) -> Iterator[tuple[np.ndarray, np.
         yield x, params.force_limit * rng.uniform(-1, 1, params.action_size), np.asarray(task.at(c, time))
 
 
-def _anywhere(rng: np.random.Generator, params: BallbotParams) -> Iterator[tuple[np.ndarray, float]]:
+def _anywhere(rng: np.random.Generator, params: Robot) -> Iterator[tuple[np.ndarray, float]]:
     """States with components of both signs, near zero and far from it, each with a time, s."""
     for scale, time in itertools.product(_SCALES, _TIMES):
         yield rng.uniform(-scale, scale, params.state_size), time

@@ -17,9 +17,9 @@ static void advance(const real *restrict x, int64_t sx, const real *restrict c, 
                     const real *restrict t, int64_t st, real *restrict end, int64_t send, real *restrict force, int64_t sforce,
                     real *restrict grip, int64_t sgrip, real *restrict pay, int64_t spay, real *restrict flags, int64_t sflags,
                     real *restrict violated, int64_t sviolated);
-/* states, constants, numbers of steps taken -> observations, tilts */
+/* states, constants, numbers of steps taken -> observations, measurements */
 static void look(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict t, int64_t st,
-                 real *restrict seen, int64_t sseen, real *restrict tilt, int64_t stilt);
+                 real *restrict seen, int64_t sseen, real *restrict measured, int64_t smeasured);
 /* random numbers -> constants */
 static void draw_constants(const real *restrict z, int64_t sz, real *restrict c, int64_t sc);
 /* random numbers, constants -> states */
@@ -72,11 +72,11 @@ void ballbot_start(int64_t B, int64_t count, const int64_t *which, const int64_t
     }
 }
 
-/* What the count robots that which lists see, and their tilts. */
+/* What the count robots that which lists see, and their measurements. */
 void ballbot_observe(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c,
-                    real *seen, real *tilt) {
+                    real *seen, real *measured) {
     for (int64_t m = 0; m < count; m += LANES) {
-        real xs[STATES * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, taken[LANES] = {0}, ss[SEEN * LANES], ts[LANES];
+        real xs[STATES * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, taken[LANES] = {0}, ss[SEEN * LANES], ms[AT_LEAST_1(MEASURED) * LANES];
         for (int k = 0; k < LANES && m + k < count; ++k) {
             taken[k] = (real)steps[which[m + k]];
             for (int i = 0; i < STATES; ++i)
@@ -84,11 +84,12 @@ void ballbot_observe(int64_t B, int64_t count, const int64_t *which, const int64
             for (int i = 0; i < CONSTANTS; ++i)
                 cs[i * LANES + k] = c[i * B + which[m + k]];
         }
-        look(xs, LANES, cs, LANES, taken, LANES, ss, LANES, ts, LANES);
+        look(xs, LANES, cs, LANES, taken, LANES, ss, LANES, ms, LANES);
         for (int k = 0; k < LANES && m + k < count; ++k) {
             for (int i = 0; i < SEEN; ++i)
                 seen[i * B + which[m + k]] = ss[i * LANES + k];
-            tilt[which[m + k]] = ts[k];
+            for (int i = 0; i < MEASURED; ++i)
+                measured[i * B + which[m + k]] = ms[i * LANES + k];
         }
     }
 }
@@ -96,8 +97,8 @@ void ballbot_observe(int64_t B, int64_t count, const int64_t *which, const int64
 /* Robots that a thread takes at once. */
 enum { CHUNK = 32 * LANES };
 
-/* Rows of what is told of a robot: state, tilt, force, the floor's grip. */
-enum { TILT = STATES, FORCE = STATES + 1, GRIPPED = FORCE + ACTIONS, TOLD = GRIPPED + GRIP };
+/* Rows of what is told of a robot: state, measurements, force, the floor's grip. */
+enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, TOLD = GRIPPED + GRIP };
 
 /* Rows of flags, which are those of codegen.FLAGS and one more; and of pay. */
 enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
@@ -176,7 +177,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     if (count == LANES) {
         advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, told, B, told + FORCE * B, B,
                 told + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
-        look(told, B, m->c + n, B, after, LANES, m->seen + n, B, told + TILT * B, B);
+        look(told, B, m->c + n, B, after, LANES, m->seen + n, B, told + MEASUREMENTS * B, B);
         tell(m, n, LANES, paid, marks, limit);
     } else {
         real in[(STATES + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
@@ -185,7 +186,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
         rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
         advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
                 out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
-        look(out, LANES, cs, LANES, after, LANES, ss, LANES, out + TILT * LANES, LANES);
+        look(out, LANES, cs, LANES, after, LANES, ss, LANES, out + MEASUREMENTS * LANES, LANES);
         rows_copy(TOLD, count, out, LANES, told, B);
         rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
         tell(m, n, count, paid, marks, limit);
@@ -232,7 +233,7 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
         begun[count++] = n;
     }
     ballbot_start(B, count, begun, m->seed, episode, 0, m->told, m->new_c);
-    ballbot_observe(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + TILT * B);
+    ballbot_observe(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + MEASUREMENTS * B);
 }
 
 /* One control step of a batch. Threads that call it with the same memory take chunks in turns, until all are done. */

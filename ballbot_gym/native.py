@@ -23,8 +23,7 @@ from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.identity import problem_digest
 from ballbot_gym.machine_code import NoMachineCodeError
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
 
@@ -57,7 +56,7 @@ class BallbotNative:
         task: Task,
         num_envs: int,
         dtype: type[np.floating],
-        params: BallbotParams,
+        params: Robot,
         threads: int = 1,
         code: Any = None,
     ):
@@ -81,7 +80,7 @@ class BallbotNative:
         self._code = code or _code(task, params, dtype is np.float64)
         self._all = np.arange(self.num_envs)
         self._seen_rows = task.observation_size(params)
-        self._told_rows = params.state_size + 1 + params.action_size + (4 if params.grips else 0)
+        self._told_rows = params.state_size + len(params.MEASUREMENTS) + params.action_size + (4 if params.grips else 0)
         size, nothing = self.num_envs, np.zeros((0, self.num_envs), dtype)
         x, c = (np.zeros((rows, size), dtype) for rows in (params.state_size, len(task.constant_names)))
         seeds = np.array(seeds_of(int(np.random.SeedSequence().generate_state(1)[0]), size))
@@ -147,9 +146,9 @@ class BallbotNative:
         """(B, no) observations of a state."""
         return self._seen(state)[0].astype(np.float32, copy=False).T
 
-    def tilt(self, state: State) -> np.ndarray:
-        """(B,) rad, of a state."""
-        return self._seen(state)[1]
+    def measurements(self, state: State) -> dict[str, np.ndarray]:
+        """(B,) what the robot measures in a state, by name."""
+        return self.params.named_measurements(self._seen(state)[1])
 
     def step(self, actions: np.ndarray, waiting: np.ndarray | None = None) -> Step:
         """Holds forces for one control step; see `autoreset.step`."""
@@ -204,19 +203,20 @@ class BallbotNative:
 
     def _info(self, state: State, rows: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray) -> Info:
         """An info of a state and of rows that native.c has written."""
-        tilt = self.params.state_size
-        grip = tilt + 1 + self.params.action_size
-        force, (success, failure, clipped) = rows[tilt + 1 : grip], flags[:3]
+        measured = self.params.state_size
+        pulls = measured + len(self.params.MEASUREMENTS)
+        grip = pulls + self.params.action_size
+        force, (success, failure, clipped) = rows[pulls:grip], flags[:3]
         did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._told_rows]
-        return info_of(state, rows[tilt], violated, *did)
+        return info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """(no, B) what all envs see, and (B,) their tilts."""
+        """(no, B) what all envs see, and their measurements, a row (B,) each."""
         seen = np.empty((self._seen_rows, self.num_envs), self.dtype)
-        tilt = np.empty(self.num_envs, self.dtype)
-        arrays = self._all, state.steps, state.x, state.c, seen, tilt
+        measured = np.empty((len(self.params.MEASUREMENTS), self.num_envs), self.dtype)
+        arrays = self._all, state.steps, state.x, state.c, seen, measured
         self._code.ballbot_observe(self.num_envs, self.num_envs, *_pointers(*arrays))
-        return seen, tilt
+        return seen, measured
 
     def _run(self, memory: "_Memory") -> None:
         """A step, by several threads where that is faster."""
@@ -253,7 +253,7 @@ def _pointer(array: np.ndarray) -> int:
         return array.ctypes.data
 
 
-def _check(code: ctypes.CDLL, task: Task, params: BallbotParams, double: bool) -> None:
+def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
     """Raises a NoMachineCodeError unless functions compute the same with CasADi's symbols as with numbers.
 
     A symbol that is made a float, for one, becomes NaN without a word.
@@ -262,7 +262,7 @@ def _check(code: ctypes.CDLL, task: Task, params: BallbotParams, double: bool) -
 
     dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
-    actions = np.asfortranarray(np.array(actions, dtype)[:, : params.action_size])
+    actions = np.asfortranarray(np.array(actions, dtype)[:, np.arange(params.action_size) % 3])
     told = []
     batch = (
         BallbotNative(task, len(actions), dtype, params, code=code),
@@ -285,7 +285,7 @@ def _check(code: ctypes.CDLL, task: Task, params: BallbotParams, double: bool) -
             raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
 
 
-def _source(task: Task, params: BallbotParams, double: bool) -> str:
+def _source(task: Task, params: Robot, double: bool) -> str:
     """The C code of a task and a robot: `codegen`'s, or where CasADi is missing what a wheel has of it.
 
     Raises:
@@ -299,13 +299,13 @@ def _source(task: Task, params: BallbotParams, double: bool) -> str:
     return codegen.source(task, params, double)
 
 
-def code_name(task: Task, params: BallbotParams, double: bool) -> str:
+def code_name(task: Task, params: Robot, double: bool) -> str:
     """What the code of a task and a robot is called where wheels keep it."""
     return f"{type(task).__name__.lower()}-{problem_digest(task, params)}-{'double' if double else 'float'}"
 
 
 @cache
-def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
+def _code(task: Task, params: Robot, double: bool) -> ctypes.CDLL:
     """The library of a task and a robot, once it was checked.
 
     Raises:

@@ -71,6 +71,22 @@ def clip(a: Any, low: Any, high: Any) -> Any:
     return library.fmax(library.fmin(a, high), low) if _is_casadi(a) else library.clip(a, low, high)
 
 
+def minimum(a: Any, b: Any) -> Any:
+    """The lesser of two numbers, elementwise."""
+    return _least_or_greatest("minimum", "fmin", min, a, b)
+
+
+def maximum(a: Any, b: Any) -> Any:
+    """The greater of two numbers, elementwise."""
+    return _least_or_greatest("maximum", "fmax", max, a, b)
+
+
+def _least_or_greatest(name: str, of_symbols: str, of_floats: Any, a: Any, b: Any) -> Any:
+    if isinstance(a, float | int) and isinstance(b, float | int):
+        return of_floats(a, b)
+    return getattr(_library(a), of_symbols if _is_casadi(a) else name)(a, b)
+
+
 def where(condition: Any, a: Any, b: Any) -> Any:
     """a where the condition holds, else b, elementwise. Not for what optimizers differentiate: they need smooth functions."""
     if isinstance(condition, bool | np.bool_):

@@ -18,9 +18,17 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import PAPER, ROBOTS, Robot, check_name, named_robot, register_robot, short_name
+from ballbot_gym.robot import (
+    PAPER,
+    ROBOTS,
+    Randomization,
+    Registered,
+    Robot,
+    check_name,
+    named_robot,
+    register_robot,
+    short_name,
+)
 from ballbot_gym.tasks import SHIPPED, TASKS, Task
 from ballbot_gym.tasks.checks import check_methods
 
@@ -62,8 +70,8 @@ def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
             f"register_task: the id {kind.id} of {kind.__name__} is taken in Gymnasium; give it another id"
         )
     if kind not in SHIPPED:
-        task = kind()
-        check_methods(task, default_params(), *task.sample(np.random.default_rng(0), default_params()))
+        task, robot = kind(), named_robot(kind.ROBOT)
+        check_methods(task, robot, *task.sample(np.random.default_rng(0), robot))
     module = "" if kind in SHIPPED or kind.__module__ in _MAIN else f"{kind.__module__}:"
     gymnasium.registry.pop(kind.id, None)
     gymnasium.register(
@@ -101,7 +109,7 @@ def name_of(task: Task) -> str | None:
 
 
 def spec_of(
-    spec: EnvSpec | None, task: Task, params: BallbotParams, randomization: Randomization, steps: int | None = None
+    spec: EnvSpec | None, task: Task, params: Robot, randomization: Randomization, steps: int | None = None
 ) -> EnvSpec | None:
     """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
     was asked for, and without a reward threshold where another problem, robot or pay makes it meaningless.
@@ -183,14 +191,14 @@ def load_plugins() -> None:
                 warnings.warn(f"{package}: {group} {entry.name!r} ({entry.value}) fails: {error!r}", stacklevel=2)
 
 
-def registered() -> tuple[tuple[str, ...], dict[str, Robot]]:
+def registered() -> tuple[tuple[str, ...], dict[str, Registered]]:
     """What `restore` needs in another process: modules that registered tasks, and the robots that do not come with us."""
     modules = {kind.__module__: None for kind in TASKS.values() if kind not in SHIPPED}
     robots = {name: robot for name, robot in ROBOTS.items() if name not in _SHIPPED_ROBOTS}
     return tuple(name for name in modules if name not in _MAIN and name in sys.modules), robots
 
 
-def restore(modules: tuple[str, ...], robots: Mapping[str, Robot]) -> None:
+def restore(modules: tuple[str, ...], robots: Mapping[str, Registered]) -> None:
     """Registers here what `registered` gave in another process."""
     for module in modules:
         import_module(module)

@@ -13,8 +13,7 @@ from ballbot_gym.checks import real_array
 from ballbot_gym.display import Moving
 from ballbot_gym.engines import checked_physics, make_simulator
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
@@ -43,9 +42,7 @@ class ActionController:
     what `ROBOT_FACTORS` names, as far as it is known.
     """
 
-    def __init__(
-        self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0
-    ):
+    def __init__(self, task: Task, params: Robot, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0):
         """Wraps a function.
 
         Args:
@@ -63,7 +60,7 @@ class ActionController:
         self._c, self._begins = _components(c), True
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        own = np.array(self._task.seen(_components(x), self._task.at(self._c, t)), np.float32).T
+        own = np.array(self._task.seen(_components(x), self._task.at(self._c, t), self._params), np.float32).T
         if self._begins:
             still = np.zeros((*own.shape[:-1], self._params.action_size), np.float32)
             self._past = np.tile(np.concatenate([own, still], -1), self._history)
@@ -184,7 +181,7 @@ def sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
 
 def simulate(
     controller: Controller,
-    params: BallbotParams,
+    params: Robot,
     x0: np.ndarray,
     duration: float,
     control_dt: float = 0.02,

@@ -11,32 +11,19 @@ import logging
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from ballbot_gym import dynamics, machine_code, traced
-from ballbot_gym.params import BallbotParams
+from ballbot_gym import machine_code, traced
+from ballbot_gym.robot import Robot
+from ballbot_gym.step import Outcome, outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import outcome
 
 _log = logging.getLogger(__name__)
 
-ROBOT = (
-    "moving_mass",
-    "first_moment",
-    "pivot_inertia",
-    "axial_inertia",
-    "gravity",
-    "ball_radius",
-    "ball_inertia",
-    "force_limit",
-)
-"""What the equations of motion take of a robot."""
-
 _TRIALS = 64
-_JUDGED = 9  # an outcome, and the tilt
+_JUDGED = len(Outcome._fields)
 
 State = tuple[float, ...]
 
@@ -63,19 +50,18 @@ class Work:
         self.call = partial(function, ctypes.c_void_p(self.numbers.ctypes.data))
 
 
-def motion(params: BallbotParams, dt: float) -> Work | None:
+def motion(params: Robot, dt: float) -> Work | None:
     """An RK4 step of dt, s, in place, from a state and a force; None where there is no machine code.
 
-    Its last arguments are what `ROBOT` names, of any robot of the same kind, with the same wheels.
+    Its last arguments are `Robot.numbers` of any robot of the same kind.
     """
-    kind = {"rolls": params.rolls, "wheels": params.wheels}
+    kind = params.kind
 
     def compute(x: tuple, u: tuple, dt: tuple, robot: tuple) -> tuple:
-        model: Any = SimpleNamespace(**kind, **dict(zip(ROBOT, robot, strict=True)))
-        return dynamics.step(model, x, u, dt[0], 1)
+        return kind.model(robot).step(x, u, dt[0], 1)
 
     states, held = params.state_size, params.state_size + params.action_size
-    code = _code(("motion", *kind.values()), compute, (states, held - states, 1, len(ROBOT)), in_place=True)
+    code = _code(kind, compute, (states, held - states, 1, len(kind.numbers)), in_place=True)
     if code is None:
         return None
     work = Work(code, held, states)
@@ -90,15 +76,16 @@ class Judge(Work):
     (2,) in N; they are longer with wheels. They are overwritten by the next.
     """
 
-    def __init__(self, code: Code, task: Task, params: BallbotParams):
+    def __init__(self, code: Code, task: Task, params: Robot):
         states, held = params.state_size, params.state_size + params.action_size
         given = held + states + 2
-        super().__init__(code, given, _JUDGED)
-        self.seen = self.numbers[1 + _JUDGED :][: task.observation_size(params)]
+        judged = _JUDGED + len(params.MEASUREMENTS)
+        super().__init__(code, given, judged)
+        self.seen = self.numbers[1 + judged :][: task.observation_size(params)]
         _, self.force, self.x, _, self.c = np.split(self.given, (states, held, held + states, given))
 
     def judge(self, before: State, force: tuple[float, ...], x: State, steps: int, kept: float) -> State | None:
-        """(9,) what a force, N, did that led from one state to the state x: an `Outcome`, and the tilt at its end, rad.
+        """What a force, N, did that led from one state to the state x: an `Outcome`, and the robot's measurements at its end.
 
         None where Python must compute it.
 
@@ -114,7 +101,7 @@ class Judge(Work):
         return self.unpack() if self.check[0] == 0 else None
 
 
-def judge(task: Task, params: BallbotParams) -> Judge | None:
+def judge(task: Task, params: Robot) -> Judge | None:
     """The judge of a task, for robots with as large states; None where there is no machine code."""
 
     def compute(before: tuple, u: tuple, x: tuple, step: tuple, c: tuple) -> tuple:
@@ -122,10 +109,12 @@ def judge(task: Task, params: BallbotParams) -> Judge | None:
         did = outcome(task, before, u, x, c, steps, (kept,))
         c = task.at(c, steps * task.control_dt)
         finite = (*task.limits(x, c), *task.goal(x, c))  # an outcome does not tell
-        return (*did, dynamics.tilt(x), *task.seen(x, c), *finite)
+        return (*did, *params.measurements(x), *task.seen(x, c, params), *finite)
 
     states, forces = params.state_size, params.action_size
-    code = _code((task, states), compute, (states, forces, states, 2, len(task.constant_names)), in_place=False)
+    code = _code(
+        (task, params.kind, states), compute, (states, forces, states, 2, len(task.constant_names)), in_place=False
+    )
     return None if code is None else Judge(code, task, params)
 
 

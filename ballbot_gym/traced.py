@@ -68,6 +68,16 @@ def where(condition: Number, a: Any, b: Any) -> Number:
     return condition.made("{0} != 0 ? {1} : {2}", a, b)
 
 
+def minimum(a: Number, b: Any) -> Number:
+    """The lesser of two numbers."""
+    return a.made("{1} < {0} ? {1} : {0}", b)
+
+
+def maximum(a: Number, b: Any) -> Number:
+    """The greater of two numbers."""
+    return a.made("{1} > {0} ? {1} : {0}", b)
+
+
 def clip(a: Number, low: Any, high: Any) -> Number:
     """The nearest number in [low, high], as max(min(a, high), low)."""
     below = a.made("{1} < {0} ? {1} : {0}", high)

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_gym import dynamics, files
+from ballbot_gym import files
 from ballbot_gym.display import Moving
 from ballbot_gym.paths import hermite_basis
+from ballbot_gym.robot import tilt
 
 MAX_SAMPLES = 1_000_000
 """Times that `Trajectory.resampled` gives at most."""
@@ -21,7 +22,7 @@ class TrajectoryError(ValueError):
 class Trajectory(Moving):
     """States at increasing times, with the forces between them.
 
-    t: (N+1,) s. x: (N+1, 8); order and units in `dynamics.STATE`. u: (N, 2) N where each force is held until the next
+    t: (N+1,) s. x: (N+1, 8); order and units in `Ballbot.STATE`. u: (N, 2) N where each force is held until the next
     time, or (N+1, 2) where it runs linearly between times. xdot: (N+1, 8) slopes of x, if known: with them x is
     interpolated by cubics, else linearly. Of a robot with wheels x is (N+1, 11), and u has three columns.
 
@@ -80,7 +81,7 @@ class Trajectory(Moving):
     @property
     def tilt(self) -> np.ndarray:
         """(N+1,) angle between the body's axis and the vertical, rad."""
-        return dynamics.tilt(self.x)
+        return tilt(self.x)
 
     def state(self, t: float) -> np.ndarray:
         """x(t), (8,). Before the start it is the first state, after the end the last one."""

@@ -26,17 +26,14 @@ from ballbot_gym.checks import (
     real_array,
     reset_options,
 )
-from ballbot_gym.drawing import Drawing, Robot
+from ballbot_gym.drawing import Drawing, Drawn
 from ballbot_gym.drawing.picture import picture
-from ballbot_gym.env import TaskEnv, make_task
+from ballbot_gym.env import TaskEnv, make_task, robot_of
 from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.native import BallbotNative
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization, checked_randomization
-
-from ballbot_gym.robots import PAPER, checked_robot
-from ballbot_gym.sensors import check_observation, observation_space
+from ballbot_gym.robot import PAPER, Randomization, Robot, checked_randomization
+from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
@@ -81,13 +78,13 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         device: str | torch.device = "cpu",
         dtype: torch.dtype | str = "float32",
         compile: bool | str = "auto",
-        params: BallbotParams | None = None,
+        params: Robot | None = None,
         randomization: Randomization | str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         physics: str = "rk4",
         max_episode_steps: int | None = None,
         engine: str = "auto",
-        robot: str | BallbotParams = PAPER,
+        robot: str | Robot = PAPER,
         history: int = 0,
         observation: str = "state",
         **task_fields: Any,
@@ -117,7 +114,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
         if engine not in _ENGINES:
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
-        params = checked_robot(robot, params)
+        params = robot_of(task, robot, params)
         task = make_task(task, params, **task_fields)
         if physics != "rk4":
             raise ValueError(
@@ -173,7 +170,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         if x is not None:
             state = self._with_x(state, x, mask)
         self.batch.state = state
-        observation, tilt = as_array(self.batch.observe(state)), as_array(self.batch.tilt(state))
+        observation, measured = as_array(self.batch.observe(state)), self.batch.measurements(state)
         self._ended = self._ended & ~mask
         force, grip = (
             np.zeros((rows, self.num_envs), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips)
@@ -181,7 +178,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         cost, parts = np.zeros(self.num_envs), np.zeros((3, self.num_envs))
         success, failure, clipped = np.zeros((3, self.num_envs), bool)
         none = filled(-1, self.num_envs)
-        info = info_of(state, tilt, none, cost, parts, force, success, failure, clipped, grip)
+        info = info_of(state, measured, none, cost, parts, force, success, failure, clipped, grip)
         return observation.astype(np.float32, copy=False), masked(info, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -251,7 +248,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             return None
         states, constants = (np.array(part.T.tolist()) for part in (self._state.x, self._state.c))
         return tuple(
-            picture(Drawing(self.params, (Robot(x),), markers=tuple(self.task.markers(c))))
+            picture(Drawing(self.params, (Drawn(x),), markers=tuple(self.task.markers(c))))
             for x, c in zip(states, constants, strict=True)
         )
 
@@ -301,7 +298,7 @@ def _in_torch(
     device: str | torch.device,
     dtype: torch.dtype | str,
     compile: bool | str,
-    params: BallbotParams,
+    params: Robot,
     **settings: Any,
 ) -> BallbotBatch | BallbotNative:
     """What computes the envs where torch is installed; arguments as of `BallbotVectorEnv`."""
@@ -332,7 +329,7 @@ def _without_torch(
     device: str,
     dtype: str,
     compile: bool | str,
-    params: BallbotParams,
+    params: Robot,
     randomization: Randomization | str | None,
     history: int,
     observation: str,
@@ -363,7 +360,7 @@ def _without_gradients(
     task: Task,
     num_envs: int,
     dtype: type[np.floating],
-    params: BallbotParams,
+    params: Robot,
     plain: bool,
     threads: int,
 ) -> BallbotNative | None:

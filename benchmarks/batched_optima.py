@@ -15,7 +15,7 @@ import tyro
 from ballbot_baselines import find_optima, find_optimum
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import fresh

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 import tyro
 
-from ballbot_gym import dynamics, files
+from ballbot_gym import files
 from ballbot_gym.engines import Simulator, State, installed_physics, make_simulator
 from ballbot_gym.engines.simulator import MOST_FRICTION
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import Robot, named_robot, tilt
 
 _DT = 0.02  # s, a control step
 _EXACT = 0.0001  # s, a step of the closed form whose error is rounding's
@@ -67,7 +66,7 @@ def free_fall(physics: str, name: str) -> Iterator[tuple[str, float, str]]:
     """Energy gained until a robot without forces leans by 1 rad, in parts of the potential energy that it fell through."""
     robot = replace(named_robot(name), friction=math.inf)
     states = _run(_simulator(physics, robot, _DT), _FALLING, (0.0, 0.0), 100)
-    end = next(x for x in states if dynamics.tilt(x) > 1)
+    end = next(x for x in states if tilt(x) > 1)
     fallen = _potential(robot, _FALLING) - _potential(robot, end)
     yield "energy of a free fall over, gained", (_energy(robot, end) - _energy(robot, _FALLING)) / fallen, ""
 
@@ -102,7 +101,7 @@ def flight(physics: str) -> Iterator[tuple[str, float, str]]:
 class DrakeContactSimulator(Simulator):
     """A robot whose ball rolls in Drake, with point contact: a chain of joints like MuJoCo's."""
 
-    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+    def __init__(self, params: Robot, control_dt: float, physics_dt: float | None = None):
         """Args: as of the engines; physics_dt is 1 ms by default."""
         from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
         from pydrake.math import RigidTransform, RotationMatrix
@@ -183,7 +182,7 @@ class DrakeContactSimulator(Simulator):
         return float(self._plant.EvalBodySpatialVelocityInWorld(self._context, self._ball).rotational()[2])
 
 
-def _simulator(physics: str, robot: BallbotParams, control_dt: float, physics_dt: float | None = None) -> Any:
+def _simulator(physics: str, robot: Robot, control_dt: float, physics_dt: float | None = None) -> Any:
     make = DrakeContactSimulator if physics == "drake" else partial(make_simulator, physics)
     return make(robot, control_dt, physics_dt)
 
@@ -193,18 +192,18 @@ def _run(simulator: Simulator, x: tuple[float, ...], force: tuple[float, float],
     return [simulator.step(force) for _ in range(steps)]
 
 
-def _potential(robot: BallbotParams, x: tuple[float, ...]) -> float:
+def _potential(robot: Robot, x: tuple[float, ...]) -> float:
     return robot.body_mass * robot.gravity * robot.com_height * math.cos(x[2]) * math.cos(x[3])
 
 
-def _energy(robot: BallbotParams, x: tuple[float, ...]) -> float:
+def _energy(robot: Robot, x: tuple[float, ...]) -> float:
     """Kinetic and potential, J, of a robot whose ball translates, or rolls in grip."""
     _, _, gamma, theta, vx, vy, dgamma, dtheta = x
     m, arm = robot.body_mass, robot.com_height
     sine, cosine, lean, upright = math.sin(gamma), math.cos(gamma), math.sin(theta), math.cos(theta)
     wx = arm * (cosine * upright * dgamma - sine * lean * dtheta)
     wy = arm * upright * dtheta
-    total = robot.body_mass + robot.ball_mass + (robot.ball_inertia / robot.ball_radius**2 if robot.rolls else 0.0)
+    total = robot.moving_mass
     pivot = robot.inertia + m * arm**2
     turning = (pivot * upright**2 + robot.axial_inertia * lean**2) * dgamma**2 + pivot * dtheta**2
     return 0.5 * total * (vx**2 + vy**2) + m * (vx * wx + vy * wy) + 0.5 * turning + _potential(robot, x)

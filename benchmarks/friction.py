@@ -9,11 +9,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballbot_gym import certified, dynamics, files
+from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.randomization import TRACKS
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import TRACKS, Robot, default_params, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
@@ -26,9 +24,9 @@ _STARTS = {  # task: the paper's start and constants
 }
 
 
-def floor_force(params: BallbotParams, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def floor_force(params: Robot, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Normal force (n,) as a fraction of the weight, and needed friction (n,), inf where the floor would have to pull."""
-    fx, fy, normal = dynamics.contact(params, trajectory.x[:-1], trajectory.u)
+    fx, fy, normal = params.contact(trajectory.x[:-1], trajectory.u)
     needed = np.where(normal > 0, np.hypot(fx, fy) / np.where(normal > 0, normal, 1), math.inf)
     return normal / params.weight, needed
 

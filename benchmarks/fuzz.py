@@ -28,6 +28,8 @@ from typing import Any
 
 import numpy as np
 
+from ballbot_gym.robot import read_urdf
+
 _MEMORY = 3 * 2**30  # bytes that a reader may take on top of what its imports map
 _HARMLESS = 0.1  # share of the files that every reader must accept
 _SECONDS = 60.0  # of CPU, that a reader may take: a busy machine makes no reader slow
@@ -129,10 +131,10 @@ def _certified(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
 
 
 def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_gym.params import URDF_PATH, BallbotParams
+    from ballbot_gym.robot import URDF_PATH
 
     path = Path(shutil.copy(URDF_PATH, folder / "mine.urdf"))
-    return [path], lambda: BallbotParams.from_urdf(path), (ValueError,)
+    return [path], lambda: read_urdf(path), (ValueError,)
 
 
 def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
@@ -150,7 +152,7 @@ def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
     from stable_baselines3 import PPO
 
     from ballbot_gym.env import make_task
-    from ballbot_gym.params import default_params
+    from ballbot_gym.robot import default_params
     from ballbot_train.policy_files import PolicyError
     from ballbot_train.saved_models import load_actor
 
@@ -200,7 +202,7 @@ def _demos(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...
 
 def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
-    from ballbot_gym.params import default_params
+    from ballbot_gym.robot import default_params
     from ballbot_train import jobs
     from ballbot_train.learning import training
     from ballbot_train.learning.learners import shac

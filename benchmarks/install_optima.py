@@ -12,8 +12,7 @@ import numpy as np
 from ballbot_gym import certified
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.env import make_task
-from ballbot_gym.randomization import TRACKS, Randomization
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS, TRACKS, Randomization
 from ballbot_gym.tasks import TASKS
 
 CHEAPER = 1e-7  # relative: optima that differ by less are the same

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_gym import files, sensors
+from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.robot import PAPER, ROBOTS, named_robot, sensors
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_train.evaluation.controllers import FILTERED, make_controller, policy_path
 from ballbot_train.report.c_export import LQR, export_c

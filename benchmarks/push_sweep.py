@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ballbot_baselines import LqrController, NmpcController, TrajoptController
 from ballbot_gym import files
-from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.robot import Robot, default_params
 from ballbot_gym.rollout import Controller, PlanError, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 
@@ -36,7 +36,7 @@ class Unprepared:
         return self._controller.act(t, x)
 
 
-CONTROLLERS: dict[str, tuple[str, Callable[[Stabilize, BallbotParams], Controller]]] = {
+CONTROLLERS: dict[str, tuple[str, Callable[[Stabilize, Robot], Controller]]] = {
     "LQR": ("#c0392b", LqrController),
     "TO, re-planned": ("#1f6fb2", TrajoptController),
     "NMPC": ("#e08a00", lambda task, params: Unprepared(NmpcController(task, params))),
@@ -52,7 +52,7 @@ class Push:
     impulse: float
 
 
-def after_push(params: BallbotParams, impulse: float, bearing: float) -> np.ndarray:
+def after_push(params: Robot, impulse: float, bearing: float) -> np.ndarray:
     """(8,) the state at rest just after a horizontal impulse, N·s, on the body's centre of mass.
 
     Upright, each axis has [M+m, h; h, J] [v; lean rate] = [p; p·l], with the ball's force finite and so no part in it.
@@ -63,7 +63,7 @@ def after_push(params: BallbotParams, impulse: float, bearing: float) -> np.ndar
     return np.concatenate([np.zeros(4), speed * direction, lean_rate * direction])
 
 
-def survives(task: Stabilize, params: BallbotParams, controller: Controller, impulse: float, bearing: float) -> bool:
+def survives(task: Stabilize, params: Robot, controller: Controller, impulse: float, bearing: float) -> bool:
     """Whether the tilt stays within the task's limit, and the robot is upright at the end, in PyBullet."""
     try:
         run = simulate(controller, params, after_push(params, impulse, bearing), _SECONDS)
@@ -73,7 +73,7 @@ def survives(task: Stabilize, params: BallbotParams, controller: Controller, imp
 
 
 def hardest(
-    task: Stabilize, params: BallbotParams, controller: Controller, bearing: float, near: float, resolution: float
+    task: Stabilize, params: Robot, controller: Controller, bearing: float, near: float, resolution: float
 ) -> float:
     """The largest impulse survived, N·s, by bisection from a bracket about `near`, to `resolution`.
 

@@ -24,7 +24,7 @@ from ballbot_baselines.paper.collocation import Guess, Problem, hermite_simpson,
 from ballbot_baselines.paper.problems import PAPER_PROBLEMS
 from ballbot_baselines.solvers.ocp import OcpSolver
 from ballbot_gym import files
-from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
+from ballbot_gym.robot import URDF_PATH, Robot, default_params
 from ballbot_gym.rollout import PlanError
 
 PROBLEMS = ("stabilize-1", "stabilize-5", "turn-3", "turn-10")
@@ -78,7 +78,7 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
     print(f"written to {out}")
 
 
-def time_ours(problem: Problem, params: BallbotParams, guess: Guess, repeats: int) -> tuple[float, ...]:
+def time_ours(problem: Problem, params: Robot, guess: Guess, repeats: int) -> tuple[float, ...]:
     """Cost, and seconds to build, to solve from the guess, and to solve again from the solution."""
     start = time.perf_counter()
     OcpSolver(hermite_simpson(problem, params), problem.intervals, "fatrop")
@@ -93,7 +93,7 @@ def time_ours(problem: Problem, params: BallbotParams, guess: Guess, repeats: in
     return plans[0].cost, built, float(np.median([plan.seconds for plan in plans])), float(np.median(warm))
 
 
-def time_drake(problem: Problem, params: BallbotParams, guess: Guess, repeats: int) -> tuple[float, ...]:
+def time_drake(problem: Problem, params: Robot, guess: Guess, repeats: int) -> tuple[float, ...]:
     """The same of Drake's DirectCollocation with SNOPT."""
     start = time.perf_counter()
     collocation = drake_collocation(problem, params)
@@ -110,7 +110,7 @@ def time_drake(problem: Problem, params: BallbotParams, guess: Guess, repeats: i
     return result.get_optimal_cost(), built, cold, warm
 
 
-def drake_collocation(problem: Problem, params: BallbotParams) -> DirectCollocation:
+def drake_collocation(problem: Problem, params: Robot) -> DirectCollocation:
     """A paper problem between two states, on the URDF that this package simulates."""
     plant = MultibodyPlant(time_step=0.0)
     Parser(plant).AddModels(str(URDF_PATH))
@@ -137,7 +137,7 @@ def drake_collocation(problem: Problem, params: BallbotParams) -> DirectCollocat
     return collocation
 
 
-def time_compilation(params: BallbotParams) -> float:
+def time_compilation(params: Robot) -> float:
     """Seconds that an empty cache costs one problem."""
     problem, kept = PAPER_PROBLEMS[PROBLEMS[0]].problem, os.environ.get("BALLBOT_CACHE")
     seconds = []

@@ -19,11 +19,11 @@ from PIL import Image
 
 from ballbot_baselines import CONTROLLERS, find_optimum
 from ballbot_gym import certified, files
-from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym.drawing import GHOST_OPACITY, Drawing, Drawn, GroundPath
 from ballbot_gym.drawing.picture import picture
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
@@ -116,7 +116,7 @@ def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
 def drawing(replay: Replay, optimum: Trajectory, t: float) -> Drawing:
     """A moment, s, with the optimum as a ghost."""
     drawn = replay.drawing(replay.takes[0], t)
-    ghost = Robot(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY)
+    ghost = Drawn(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY)
     path = GroundPath(driven_path(optimum, t), labels.OPTIMUM, True)
     return replace(drawn, robots=(ghost, *drawn.robots), paths=(*drawn.paths, path))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ballbot_gym import files
 from ballbot_gym.engines import PHYSICS_NAMES
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.verify import regret
 from ballbot_train.console import markdown

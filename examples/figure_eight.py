@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ballbot_baselines import along_path
-from ballbot_gym import BallbotParams, Reference, Task, ops, register_task
+from ballbot_gym import BallbotTask, Reference, Robot, ops, register_task
 
 
 @register_task
 @dataclass(frozen=True)
-class FigureEight(Task):
+class FigureEight(BallbotTask):
     """Ride with a point that moves along an eight of a given half width, once round in `period`."""
 
     duration: float = 6.0
@@ -29,10 +29,10 @@ class FigureEight(Task):
     state_draws = 4
     clock = True
 
-    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_constants(self, z: tuple[Any, ...], params: Robot) -> tuple[Any, ...]:
         return (ops.between(z[0], 0.8, 1.5),)
 
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Robot) -> tuple[Any, ...]:
         px, py, gamma, theta = (
             ops.between(part, -size, size) for part, size in zip(z, (0.5, 0.5, 0.2, 0.2), strict=True)
         )
@@ -76,11 +76,11 @@ class FigureEight(Task):
         position, _, _ = self._point((c[0], self.control_dt * np.arange(self.steps + 1)))
         return np.stack(position, axis=1)
 
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Robot) -> Reference:
         states, forces = along_path(params, self._path(c), self.control_dt)
         return Reference(states[:-1], forces)
 
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Robot) -> list[np.ndarray]:
         path = self._path(c)
         late = np.exp(-2.0 * self.control_dt * np.arange(len(path)))[:, None]
         return [path + late * (x[:2] - path[0])]

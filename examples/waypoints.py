@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ballbot_baselines import along_path
-from ballbot_gym import BallbotParams, Marker, Reference, Task, catmull_rom, ops, register_task
+from ballbot_gym import BallbotTask, Marker, Reference, Robot, catmull_rom, ops, register_task
 
 
 @register_task
 @dataclass(frozen=True)
-class Waypoints(Task):
+class Waypoints(BallbotTask):
     """From rest past three points, one every `interval`, and to rest at the last of them."""
 
     duration: float = 6.0
@@ -31,10 +31,10 @@ class Waypoints(Task):
     state_draws = 2
     clock = True
 
-    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_constants(self, z: tuple[Any, ...], params: Robot) -> tuple[Any, ...]:
         return tuple(ops.between(part, -1.5, 1.5) for part in z)
 
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Robot) -> tuple[Any, ...]:
         gamma, theta = (ops.between(part, -0.2, 0.2) for part in z)
         return (0.0 * gamma, 0.0 * gamma, gamma, theta, 0.0 * gamma, 0.0 * gamma, 0.0 * gamma, 0.0 * gamma)
 
@@ -80,11 +80,11 @@ class Waypoints(Task):
         curves = (catmull_rom(knots, np.array([begin, *c[i::2], c[4 + i]]), time) for i, begin in enumerate(start))
         return np.stack(tuple(curves), axis=1)
 
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Robot) -> Reference:
         states, forces = along_path(params, self._path(x[:2], c), self.control_dt)
         return Reference(states[:-1], forces)
 
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Robot) -> list[np.ndarray]:
         return [self._path(x[:2], c)]
 
     def markers(self, c: np.ndarray) -> list[Marker]:

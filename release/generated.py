@@ -18,7 +18,7 @@ import numpy as np
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
 from ballbot_gym import BallbotEnv, BallbotVectorEnv, codegen, machine_code, native, rollout
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, ROBOTS
+from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 

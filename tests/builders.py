@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS
 from ballbot_train.evaluation.results import Result
 
 _FIELDS = {

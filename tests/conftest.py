@@ -15,8 +15,7 @@ import pytest
 
 import ballbot_gym
 from ballbot_gym.engines import installed_physics
-from ballbot_gym.params import default_params
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS, default_params
 from ballbot_gym.tasks import TASKS
 
 _NUMBERS = itertools.count()

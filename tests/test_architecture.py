@@ -144,7 +144,7 @@ def test_no_default_reads_a_urdf_when_its_module_is_imported():
             elif not isinstance(node, ast.Lambda):
                 waiting += ast.iter_child_nodes(node)
 
-    readers = {"default_params", "params.default_params", "BallbotParams.from_urdf"}
+    readers = {"default_params", "params.default_params", "read_urdf"}
     assert relative(path for path in FILES if readers & set(early_calls(path))) == []
 
 

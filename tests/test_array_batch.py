@@ -10,7 +10,7 @@ import pytest
 
 from ballbot_gym import machine_code
 from ballbot_gym.array_batch import BallbotArrays
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector import BallbotVectorEnv
 
@@ -81,7 +81,6 @@ import importlib.util
 find = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *rest: None if name in ("torch", "casadi", "scipy") else find(name, *rest)
 import gymnasium, numpy as np, ballbot_gym
-from ballbot_gym.robots import ROBOTS
 for task in ballbot_gym.TASKS.values():
     envs = gymnasium.make_vec(task.id, num_envs=3)
     observations, infos = envs.reset(seed=0)

@@ -24,8 +24,7 @@ from ballbot_baselines import Backoff
 from ballbot_gym import BallbotEnv, certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
-from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import URDF_PATH, Randomization, default_params, read_urdf
 from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.vector import BallbotVectorEnv
@@ -158,9 +157,9 @@ TASKS = [
 ROBOTS = [
     (params(body_mass=math.nan), "body_mass must be positive and finite, not nan"),
     (params(inertia="1"), "inertia must be a number, not '1'"),
-    (lambda f: BallbotParams.from_urdf(f / "none.urdf"), "none.urdf: no such file"),
-    (lambda f: BallbotParams.from_urdf(f), "is no regular file; give the path of a URDF"),
-    (lambda f: BallbotParams.from_urdf("a\0b"), "give the path of a URDF"),
+    (lambda f: read_urdf(f / "none.urdf"), "none.urdf: no such file"),
+    (lambda f: read_urdf(f), "is no regular file; give the path of a URDF"),
+    (lambda f: read_urdf("a\0b"), "give the path of a URDF"),
 ]
 
 
@@ -172,7 +171,7 @@ def urdf(old, new, count=1):
         assert old in text
         path = folder / "mine.urdf"
         path.write_text(text.replace(old, new, count))
-        return BallbotParams.from_urdf(path)
+        return read_urdf(path)
 
     return read
 
@@ -189,9 +188,9 @@ def written(content, reader, name="file"):
 
 
 URDFS = [
-    (written('<?xml version="1.0" encoding="klingon"?><robot/>', BallbotParams.from_urdf), "not well-formed XML"),
-    (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", BallbotParams.from_urdf), "missing"),
-    (written("<robot/>", BallbotParams.from_urdf), "link 'ball' is missing"),
+    (written('<?xml version="1.0" encoding="klingon"?><robot/>', read_urdf), "not well-formed XML"),
+    (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", read_urdf), "missing"),
+    (written("<robot/>", read_urdf), "link 'ball' is missing"),
     (urdf('<link name="body">', '<link name="ball">'), "link 'ball' is there 2 times"),
     (urdf('"15"', '"inf"'), "value = 'inf' is not a number"),
     (urdf('"1.2875"', '"1e999"'), "ixx = '1e999' is not a number"),

@@ -8,7 +8,7 @@ from builders import FunctionController
 from ballbot_baselines import find_optimum
 from ballbot_baselines.optimum.recovery import largest_leans
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import ROBOTS, named_robot
+from ballbot_gym.robot import ROBOTS, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.evaluation import basins

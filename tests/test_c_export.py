@@ -9,9 +9,9 @@ from builders import random_policy, task_and_robot
 
 from ballbot_gym import certified, machine_code
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
+from ballbot_gym.robot.sensors import SCALE
 from ballbot_gym.rollout import rollout
-from ballbot_gym.sensors import SCALE
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.policy import PolicyController, save_policy

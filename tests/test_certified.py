@@ -4,12 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballbot_gym import certified, dynamics
+from ballbot_gym import certified
 from ballbot_gym.certified import version
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
-from ballbot_gym.randomization import TRACKS, Randomization
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.robot import PAPER, ROBOTS, TRACKS, Randomization, default_params, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_leaderboard
@@ -75,7 +73,7 @@ def test_every_episode_can_be_started_and_is_certified(task, evaluation, params,
 
 def test_each_stored_state_follows_from_the_one_before(task, evaluation, params):
     for trajectory in evaluation.trajectories:
-        after = dynamics.step(params, trajectory.x[:-1], trajectory.u, task.control_dt)
+        after = params.step(trajectory.x[:-1], trajectory.u, task.control_dt)
         np.testing.assert_allclose(after, trajectory.x[1:], atol=1e-6)
 
 
@@ -88,7 +86,7 @@ def test_stored_trajectories_are_feasible_and_cost_what_is_stored(task, evaluati
         assert evaluation.costs[i] == pytest.approx(cost, rel=1e-9)
         assert np.abs(trajectory.u).max() <= params.force_limit
         assert min(np.min(margin) for margin in task.margins(trajectory.x, c)) >= 0
-        grip = dynamics.limits(params, trajectory.x[:-1], trajectory.u, hold=task.control_dt)
+        grip = params.limits(trajectory.x[:-1], trajectory.u, hold=task.control_dt)
         assert all(limit.min() > -1e-6 for limit in grip)
         if task.first_exit:
             assert task.is_goal(tuple(trajectory.x[-1]), tuple(c))

@@ -10,7 +10,7 @@ from ballbot_gym import BallbotEnv, step_code
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
-from ballbot_gym.tasks.transition import outcome
+from ballbot_gym.step import outcome
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.learners.shac import ShacConfig
 

@@ -10,8 +10,15 @@ import pytest
 
 from ballbot_gym import TASKS, Stabilize, named_robot, ops
 from ballbot_gym.identity import PARTS, changed_parts, named_problem, problem_parts
-from ballbot_gym.params import ROLLING_URDF_PATH, BallbotParams
-from ballbot_gym.robots import ROBOTS, Robot, register_robot, registered_name, robot_name
+from ballbot_gym.robot import (
+    ROBOTS,
+    ROLLING_URDF_PATH,
+    Robot,
+    read_urdf,
+    register_robot,
+    registered_name,
+    robot_name,
+)
 from ballbot_train import jobs
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.demos import demos
@@ -72,10 +79,10 @@ for kind in CHANGES.values():
     kind.__name__ = "Stabilize"
 
 
-def edited(urdf: Path, into: Path, mass: str) -> BallbotParams:
+def edited(urdf: Path, into: Path, mass: str) -> Robot:
     """The robot of a file in which the body has another mass."""
     into.write_text(urdf.read_text().replace('<mass value="15', f'<mass value="{mass}'))
-    return BallbotParams.from_urdf(into)
+    return read_urdf(into)
 
 
 @pytest.mark.parametrize("change", CHANGES)

@@ -7,7 +7,6 @@ from builders import FunctionController
 
 from ballbot_baselines import LqrController, TrajoptController, TvlqrController, find_optimum
 from ballbot_baselines.solvers.riccati import discrete_lqr
-from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
@@ -72,7 +71,7 @@ def test_simulation_without_a_task_is_the_simulators(params, physics):
     trajectory = simulate(push, params, UPRIGHT, 0.1, physics=physics)
     assert trajectory.duration == pytest.approx(0.1)
     np.testing.assert_array_equal(trajectory.u, np.tile([350.0, -20.0], (5, 1)))
-    exact = dynamics.step(params, UPRIGHT, np.array([350.0, -20.0]), 0.02)
+    exact = params.step(UPRIGHT, np.array([350.0, -20.0]), 0.02)
     np.testing.assert_allclose(trajectory.x[1], exact, atol=1e-9 if physics == "rk4" else 5e-3)
 
 

@@ -3,8 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from ballbot_gym import dynamics
-from ballbot_gym.params import URDF_PATH
+from ballbot_gym.robot import RK4_STEP, URDF_PATH, cos_tilt, tilt
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)  # high lean, all rates at work
 FORCE = (60.0, -40.0)
@@ -21,12 +20,12 @@ def random_points(count, max_tilt, seed=0):
 
 
 def integrate(params, x, u, seconds, h):
-    return np.array(dynamics.step(params, x, u, seconds, round(seconds / h)))
+    return np.array(params.step(x, u, seconds, round(seconds / h)))
 
 
 def test_linearization_at_origin_is_the_papers(params):
     z = 1e-5 * np.eye(10)
-    ahead, back = (dynamics.derivative(params, sign * z[:, :8], sign * z[:, 8:]) for sign in (1, -1))
+    ahead, back = (params.derivative(sign * z[:, :8], sign * z[:, 8:]) for sign in (1, -1))
     a, b = np.split((ahead - back).T / 2e-5, [8], axis=1)
     # the paper's (5) and (6), printed to three decimals; its c is the first digits of 0.29517
     expected_a, expected_b = np.zeros((8, 8)), np.zeros((8, 2))
@@ -40,17 +39,17 @@ def test_linearization_at_origin_is_the_papers(params):
 
 
 def test_upright_at_rest_is_an_equilibrium(params):
-    assert dynamics.derivative(params, (0.0,) * 8, (0.0, 0.0)) == (0.0,) * 8
+    assert params.derivative((0.0,) * 8, (0.0, 0.0)) == (0.0,) * 8
 
 
 def test_floats_numpy_casadi_and_torch_give_the_same_derivative(params):
     casadi, torch = pytest.importorskip("casadi"), pytest.importorskip("torch")
     x, u = random_points(200, math.radians(75))
-    batch = dynamics.derivative(params, x, u)
-    floats = [dynamics.derivative(params, tuple(a), tuple(b)) for a, b in zip(x.tolist(), u.tolist(), strict=True)]
-    tensors = dynamics.derivative(params, torch.from_numpy(x), torch.from_numpy(u))
+    batch = params.derivative(x, u)
+    floats = [params.derivative(tuple(a), tuple(b)) for a, b in zip(x.tolist(), u.tolist(), strict=True)]
+    tensors = params.derivative(torch.from_numpy(x), torch.from_numpy(u))
     sx, su = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
-    symbolic = casadi.Function("f", [sx, su], [dynamics.derivative(params, sx, su)])
+    symbolic = casadi.Function("f", [sx, su], [params.derivative(sx, su)])
     # the libraries' sines differ in the last bit, and the mass matrix's condition at 75° (below 1e3) magnifies it
     rounding = {"rtol": 1e-12, "atol": 1e-10}
     np.testing.assert_allclose(floats, batch, **rounding)
@@ -60,9 +59,9 @@ def test_floats_numpy_casadi_and_torch_give_the_same_derivative(params):
 
 def test_batches_of_any_shape_and_tuples_of_arrays_give_the_same_step(params):
     x, u = random_points(6, math.radians(60))
-    flat = dynamics.step(params, x, u, 0.02)
-    shaped = dynamics.step(params, x.reshape(2, 3, 8), u.reshape(2, 3, 2), 0.02)
-    columns = dynamics.step(params, tuple(x.T), tuple(u.T), 0.02)
+    flat = params.step(x, u, 0.02)
+    shaped = params.step(x.reshape(2, 3, 8), u.reshape(2, 3, 2), 0.02)
+    columns = params.step(tuple(x.T), tuple(u.T), 0.02)
     np.testing.assert_array_equal(shaped.reshape(6, 8), flat)
     np.testing.assert_array_equal(np.stack(columns, axis=1), flat)
 
@@ -79,7 +78,7 @@ def test_closed_form_is_drakes(params):
     plant.Finalize()
     context = plant.CreateDefaultContext()
     x, u = random_points(1000, math.radians(75))
-    ours = np.stack(dynamics.accelerations(params, x, u), axis=1)
+    ours = np.stack(params.accelerations(x, u), axis=1)
     worst = 0.0
     for state, force, mine in zip(x, u, ours, strict=True):
         plant.SetPositionsAndVelocities(context, state)
@@ -93,33 +92,33 @@ def test_energy_rate_is_the_power_of_the_force(params):
     # dE/dt = F·v; central differences over h leave h²: measured 9e-4 W at 1e-4 s and 9e-6 W here, of up to 2,600 W
     x, u = random_points(100, math.radians(70))
     h = 1e-5
-    before, after = dynamics.step(params, x, u, -h, 1), dynamics.step(params, x, u, h, 1)
-    rate = (dynamics.energy(params, after) - dynamics.energy(params, before)) / (2 * h)
+    before, after = params.step(x, u, -h, 1), params.step(x, u, h, 1)
+    rate = (params.energy(after) - params.energy(before)) / (2 * h)
     np.testing.assert_allclose(rate, (u * x[:, 4:6]).sum(axis=1), atol=1e-4)
 
 
 def test_rk4_conserves_energy_to_its_order(params):
     # fourth order: halving the step divides the drift by 16 in the limit; measured 15.0 and 15.5
     drift = [
-        abs(dynamics.energy(params, integrate(params, GENTLE, (0.0, 0.0), 0.5, h)) - dynamics.energy(params, GENTLE))
+        abs(params.energy(integrate(params, GENTLE, (0.0, 0.0), 0.5, h)) - params.energy(GENTLE))
         for h in (0.02, 0.01, 0.005)
     ]
     assert drift[0] / drift[1] > 14
     assert drift[1] / drift[2] > 14
-    assert drift[1] < 1e-6 * dynamics.energy(params, GENTLE)  # at RK4_STEP; measured 1e-7
+    assert drift[1] < 1e-6 * params.energy(GENTLE)  # at RK4_STEP; measured 1e-7
 
 
 def test_rk4_step_is_as_accurate_as_documented(params):
     exact = integrate(params, START, FORCE, 0.3, 1e-4)  # (10 ms/0.1 ms)⁴ = 1e8 times more accurate
-    error = {h: np.abs(integrate(params, START, FORCE, 0.3, h) - exact).max() for h in (0.02, dynamics.RK4_STEP)}
-    assert error[dynamics.RK4_STEP] < 1e-6  # measured: 8.1e-7
-    assert error[0.02] / error[dynamics.RK4_STEP] == pytest.approx(16, rel=0.2)
+    error = {h: np.abs(integrate(params, START, FORCE, 0.3, h) - exact).max() for h in (0.02, RK4_STEP)}
+    assert error[RK4_STEP] < 1e-6  # measured: 8.1e-7
+    assert error[0.02] / error[RK4_STEP] == pytest.approx(16, rel=0.2)
 
 
 def test_tilt_of_floats_arrays_and_tensors_is_the_same_angle(rng):
     torch = pytest.importorskip("torch")
     x = rng.uniform(-3, 3, (20, 8))
-    expected = [dynamics.tilt(tuple(row)) for row in x.tolist()]
-    np.testing.assert_allclose(dynamics.tilt(x), expected, rtol=1e-14)
-    np.testing.assert_allclose(dynamics.tilt(torch.as_tensor(x)), expected, rtol=1e-14)
-    np.testing.assert_allclose(np.cos(expected), dynamics.cos_tilt(x), atol=1e-15)
+    expected = [tilt(tuple(row)) for row in x.tolist()]
+    np.testing.assert_allclose(tilt(x), expected, rtol=1e-14)
+    np.testing.assert_allclose(tilt(torch.as_tensor(x)), expected, rtol=1e-14)
+    np.testing.assert_allclose(np.cos(expected), cos_tilt(x), atol=1e-15)

@@ -19,8 +19,7 @@ from gymnasium.utils.env_checker import check_env
 from ballbot_gym import BallbotEnv, Randomization
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import installed_physics
-from ballbot_gym.params import default_params
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import default_params, named_robot
 from ballbot_gym.rollout import simulate
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize

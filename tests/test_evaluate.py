@@ -18,7 +18,7 @@ from rich.console import Console
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train import console
 from ballbot_train.evaluation import benchmark, evaluate

@@ -7,7 +7,7 @@ import pytest
 
 from ballbot_baselines import find_optima, find_optimum
 from ballbot_gym import ops
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import named_robot
 from ballbot_gym.tasks.stabilize import Stabilize
 
 BAD = {

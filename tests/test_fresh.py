@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from ballbot_gym import certified
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.tasks.orbit import Orbit, orbit_speed
+from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave
@@ -66,7 +66,7 @@ def test_measures_are_what_their_names_say(params):
             "tilt rate, rad/s": 0.5,
         }
     )
-    speed = orbit_speed(params, 2.0, math.radians(30))
+    speed = params.steady_speed(2.0, math.radians(30))
     measured = Orbit().measures(x, np.array([2.0, -speed]), params)
     assert measured["steady tilt, degrees"] == pytest.approx(30)
     assert measured["direction, 1 is counter-clockwise"] == -1

@@ -11,7 +11,7 @@ import pytest
 from ballbot_gym import TASKS, Stabilize, Turn, named_robot
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import observation_digest, problem_digest
-from ballbot_gym.robots import ROBOTS, Robot
+from ballbot_gym.robot import ROBOTS, Registered
 from ballbot_train import evaluate, jobs, load_policy, shipped_policies
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.benchmark import open_run
@@ -162,11 +162,11 @@ def test_a_policy_is_read_for_the_numbers_of_its_robot_and_not_for_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     light, heavy = replace(PAPER, body_mass=12.0), replace(PAPER, body_mass=30.0, force_limit=900.0)
-    monkeypatch.setitem(ROBOTS, "mine", Robot(light, {}))
+    monkeypatch.setitem(ROBOTS, "mine", Registered(light, {}))
     task = Stabilize()
     path = save_policy(tmp_path / "policy", PolicyNetwork(PolicySpec.of(task, "mine", hidden=(4,))), {})
     load_policy(path)
-    monkeypatch.setitem(ROBOTS, "mine", Robot(heavy, {}))
+    monkeypatch.setitem(ROBOTS, "mine", Registered(heavy, {}))
     for read in (
         load_policy,
         lambda path: load_network(path, task, robot=None),

@@ -10,10 +10,8 @@ from resuming import goes_on_as_if_never_stopped
 from ballbot_baselines import Backoff, TvlqrController, find_optima, find_optimum
 from ballbot_baselines.optimum import batched
 from ballbot_baselines.solvers.riccati import tube_gains
-from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import routing, training
 from ballbot_train.learning.datasets import load_demos
@@ -61,7 +59,7 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way():
     observations, actions = (part.double().numpy()[:64] for part in learner.state_dict()["samples"][:2])
     robot = replace(params, body_mass=1.3 * params.body_mass, force_limit=0.9 * params.force_limit)
     x, under_way = observations[:, :8] * task.observation_scale, robot.force_limit * observations[:, 16:]
-    later = np.stack(dynamics.step(robot, tuple(x.T), tuple(under_way.T), task.control_dt, 2), 1)
+    later = np.stack(robot.step(tuple(x.T), tuple(under_way.T), task.control_dt, 2), 1)
     best = find_optima(task, robot, later, np.zeros((len(x), 0)))
     solved = [i for i, optimum in enumerate(best) if optimum]
     forces = np.array([best[i].trajectory.u[0] for i in solved])

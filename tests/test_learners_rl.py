@@ -8,7 +8,7 @@ import torch
 from resuming import goes_on_as_if_never_stopped, parameters, through_a_file
 
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for

@@ -7,7 +7,6 @@ from ballbot_baselines import LqrController, find_optimum
 from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_baselines.solvers.linearize import discretize, goal_weight, quadratic_cost
 from ballbot_baselines.solvers.riccati import discrete_lqr, tracking_gains
-from ballbot_gym import dynamics
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 
@@ -22,7 +21,7 @@ def peak_lean(trajectory):
 
 
 def step(params, x, u):
-    return dynamics.step(params, x, u, 0.02)
+    return params.step(x, u, 0.02)
 
 
 def test_weights_are_read_off_the_tasks_cost(params):
@@ -35,7 +34,7 @@ def test_discrete_model_is_the_continuous_ones_exponential(params):
     from scipy.linalg import expm
 
     z = 1e-5 * np.eye(10)
-    ahead, back = (dynamics.derivative(params, sign * z[:, :8], sign * z[:, 8:]) for sign in (1, -1))
+    ahead, back = (params.derivative(sign * z[:, :8], sign * z[:, 8:]) for sign in (1, -1))
     ad, bd = discretize(params, ORIGIN[None], NO_FORCE[None], 0.02)
     exact = expm(0.02 * np.block([[(ahead - back).T / 2e-5], [np.zeros((2, 10))]]))
     # RK4 over 10 ms: (7.77·0.01)⁵/120 twice is 5e-8, times rates of up to 60

@@ -5,7 +5,7 @@ import pytest
 from builders import FunctionController
 
 from ballbot_baselines import find_optimum, regret
-from ballbot_gym import BallbotEnv, certified, dynamics, named_robot
+from ballbot_gym import BallbotEnv, certified, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
@@ -44,7 +44,7 @@ def test_another_sampling_of_the_same_motion_has_the_same_regret():
     motion = run.trajectory
     fine, force = [motion.x[0]], np.repeat(motion.u, 4, axis=0)
     for u in force:
-        fine.append(np.array(dynamics.step(ROBOT, tuple(fine[-1]), tuple(u), 0.005, 1)))
+        fine.append(np.array(ROBOT.step(tuple(fine[-1]), tuple(u), 0.005, 1)))
     t = 3 + 0.005 * np.arange(len(fine))
     coarse, found = regret(motion, "stabilize"), regret((t, np.array(fine), force), "stabilize")
     assert found.regret == pytest.approx(coarse.regret, abs=1e-6)

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from ballbot_baselines.solvers.riccati import discrete_lqr
-from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import named_robot
 from ballbot_gym.tasks import Stabilize
 
 pytest.importorskip("mujoco")
 
 SPREAD = np.array([0.5, 0.5, 0.2, 0.2, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
-"""Of drawn starts, as `dynamics.OMNI_STATE`."""
+"""Of drawn starts, as `Ballbot.OMNI_STATE`."""
 
 
 def drawn(robot, rng, steps=25):
@@ -27,7 +26,7 @@ def drawn(robot, rng, steps=25):
         exact.reset(tuple(states[0]))
         for _ in range(steps):
             u = np.clip(-gain @ states[-1] + rng.normal(0, 5, robot.action_size), -robot.force_limit, robot.force_limit)
-            if robot.grips and not dynamics.keeps_grip(robot, dynamics.held_contact(robot, states[-1], u, 0.02)):
+            if min(robot.held(states[-1], u, 0.02)[1], default=0.0) < 0:
                 break
             forces.append(tuple(u.tolist()))
             states.append(np.array(exact.step(forces[-1])))
@@ -47,13 +46,13 @@ def test_in_grip_it_follows_the_closed_form(name, rng):
         errors.append(np.hypot(*(np.array(end) - states[-1])[:2]))
         assert abs(simulator.height()) < 1e-6
         assert np.hypot(*simulator.slip()) < 1e-5
-        if robot.rolls:
-            expected = dynamics.contact(robot, states[-1], np.array(forces[-1]))
+        if robot.CONTACT:
+            expected = robot.contact(states[-1], np.array(forces[-1]))
             np.testing.assert_allclose(simulator.floor_force(), expected, atol=1e-4 * robot.weight)
         else:
             assert simulator.floor_force() is None
     # measured: median 6e-8 m for the paper's, 1e-6 m with contact
-    assert np.median(errors) < (1e-5 if robot.rolls else 1e-6)
+    assert np.median(errors) < (1e-5 if robot.CONTACT else 1e-6)
 
 
 @pytest.mark.parametrize("force", [125.0, 200.0])

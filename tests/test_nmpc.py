@@ -7,8 +7,8 @@ pytest.importorskip("casadi")
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
 from ballbot_baselines.feedback.horizon import HorizonQp
-from ballbot_gym import certified, dynamics
-from ballbot_gym.randomization import Randomization
+from ballbot_gym import certified
+from ballbot_gym.robot import Randomization
 from ballbot_gym.rollout import rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
@@ -96,7 +96,7 @@ def test_margins_are_kept_off_the_plan(params):
     for k in range(150):
         if k == 30:
             env_x = env_x + pushed(0.0, 0.3)
-        env_x = dynamics.step(params, env_x, controller.act(k * task.control_dt, env_x), task.control_dt)
+        env_x = params.step(env_x, controller.act(k * task.control_dt, env_x), task.control_dt)
         least = min(least, *task.margins(env_x, c))
     assert least >= 0
 
@@ -109,7 +109,7 @@ def test_missed_first_exit_goal_is_planned_anew(make_env):
     controller.reset(0.0, x, c)
     k, arrival = 0, len(controller.plan.trajectory.u)
     while not env.task.is_goal(x, c) and k < env.task.steps:
-        x = dynamics.step(env.params, x, controller.act(k * 0.02, x), 0.02)
+        x = env.params.step(x, controller.act(k * 0.02, x), 0.02)
         k += 1
         if k == arrival - 5:
             x = x + pushed(0.0, 2.0)

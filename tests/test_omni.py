@@ -10,13 +10,10 @@ import pytest
 
 from ballbot_baselines import TrajoptController
 from ballbot_baselines.solvers.riccati import discrete_lqr
-from ballbot_gym import dynamics, omni
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.omni import Wheels
-from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import Randomization, Wheels, named_robot, omni
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
 from ballbot_train.learning.learners import LEARNERS
@@ -95,24 +92,24 @@ def test_the_equations_are_lagranges_with_a_multiplier_for_every_constraint(robo
         v[8:] = np.array(exact(q, v, u)[2]).ravel()
         expected = np.array(exact(q, v, u)[0]).ravel()
         scale = 1 + np.abs(expected).max()
-        np.testing.assert_allclose(dynamics.accelerations(robot, x, u), expected, rtol=0, atol=1e-9 * scale)
+        np.testing.assert_allclose(robot.accelerations(x, u), expected, rtol=0, atol=1e-9 * scale)
 
 
 def test_with_ideal_motors_and_yaw_held_it_is_the_robot_without_wheels(robot, rng):
     ideal = dataclasses.replace(robot, wheels=Wheels(0.05, 1e15, 0.0, 0.0, 0.0))
-    rolling = dataclasses.replace(robot, wheels=None)
+    rolling = robot.ideal()
     for x, force in random_states(rng):
         x = np.concatenate([x[:9], np.zeros(2)])
-        u = omni.wheel_forces(ideal, x, force[:2])
+        u = ideal.turning_ball(x, force[:2])
         # without the last two equations, because something else holds the body's yaw and the ball's spin
         matrix, right = (np.array(part, float) for part in omni.equations(ideal, x, u))
-        expected = dynamics.accelerations(rolling, x[:8], force[:2])
+        expected = rolling.accelerations(x[:8], force[:2])
         np.testing.assert_allclose(np.linalg.solve(matrix[:4, :4], right[:4]), expected, rtol=0, atol=1e-9)
 
 
 def test_energy_changes_by_the_power_of_motors_and_friction(robot, rng):
     x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
-    rate = casadi.jtimes(dynamics.energy(robot, x), x, dynamics.derivative(robot, x, u))
+    rate = casadi.jtimes(robot.energy(x), x, robot.derivative(x, u))
     w, _ = omni.relative_turning(robot, x)
     pull, drag = omni.torque(robot.ball_radius, u, x[8]), robot.wheels.drag(robot.force_limit) * robot.ball_radius**2
     lost = drag * (omni.ACROSS * (w[0] ** 2 + w[1] ** 2) + omni.ALONG * w[2] ** 2)
@@ -128,24 +125,24 @@ def test_a_wheel_at_its_no_load_speed_has_no_torque_left(robot):
     free = dataclasses.replace(robot, wheels=dataclasses.replace(robot.wheels, damping=0.0, spin_friction=0.0))
     x = np.zeros(11)
     x[10] = free.wheels.no_load_speed * free.wheels.radius / (free.ball_radius * math.sqrt(0.5))
-    assert np.abs(omni.accelerations(free, x, np.full(3, free.force_limit))).max() < 1e-9
+    assert np.abs(free.accelerations(x, np.full(3, free.force_limit))).max() < 1e-9
 
 
 def test_the_floor_gives_what_moves_the_whole_robot(robot, rng):
     """Without wheels the closed form finds the same force from the ball's rolling."""
-    rolling = dataclasses.replace(robot, wheels=None)
+    rolling = robot.ideal()
     ideal = dataclasses.replace(robot, wheels=Wheels(0.05, 1e15, 0.0, 0.0, 0.0))
     for x, force in random_states(rng):
         x = np.concatenate([x[:2], [x[2], 0.0, x[4], 0.0, x[6], 0.0], np.zeros(3)])  # in a plane it does not yaw
-        u = omni.wheel_forces(ideal, x, (force[0], 0.0))
-        expected = dynamics.contact(rolling, x[:8], (force[0], 0.0))
-        np.testing.assert_allclose(dynamics.contact(ideal, x, u), expected, atol=1e-9)
+        u = ideal.turning_ball(x, (force[0], 0.0))
+        expected = rolling.contact(x[:8], (force[0], 0.0))
+        np.testing.assert_allclose(ideal.contact(x, u), expected, atol=1e-9)
 
 
 def test_a_push_gives_its_momentum(robot, rng):
     x, _ = next(random_states(rng))
     impulse = np.array([2.0, -3.0])
-    after = dynamics.pushed(robot, x, impulse)
+    after = robot.pushed(x, impulse)
     np.testing.assert_array_equal(after[[0, 1, 2, 3, 8]], x[[0, 1, 2, 3, 8]])
 
     # the work of a short force: half the sum of the speeds of the centre of mass before and after
@@ -155,7 +152,7 @@ def test_a_push_gives_its_momentum(robot, rng):
         return x[4:6] + robot.com_height * along
 
     work = impulse @ (speed(x) + speed(after)) / 2
-    assert dynamics.energy(robot, after) - dynamics.energy(robot, x) == pytest.approx(work, rel=1e-9)
+    assert robot.energy(after) - robot.energy(x) == pytest.approx(work, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -169,12 +166,12 @@ def test_wheels_that_none_can_be_are_refused(robot, name, value, message):
 
 def test_wheels_need_a_ball_that_rolls(robot):
     with pytest.raises(ValueError, match="wheels must be Wheels"):
-        dataclasses.replace(named_robot("paper"), wheels=robot.wheels)
+        dataclasses.replace(robot, wheels=(0.05, 100.0))
 
 
 def two_force_gain(robot):
     """LQR of the robot without its wheels."""
-    return discrete_lqr(Stabilize(), dataclasses.replace(robot, wheels=None), np.zeros(8), np.zeros(2), np.zeros(0))[0]
+    return discrete_lqr(Stabilize(), robot.ideal(), np.zeros(8), np.zeros(2), np.zeros(0))[0]
 
 
 @pytest.mark.parametrize("name", ["omni", "omni_strong"])
@@ -189,13 +186,13 @@ def test_in_grip_engines_follow_the_closed_form(name, physics, module, most, rng
         exact.reset(tuple(x))
         simulator.reset(tuple(x))
         for _ in range(25):
-            u = omni.wheel_forces(robot, x, -gain @ x[:8]) + rng.normal(0, 3, 3)
+            u = robot.turning_ball(x, -gain @ x[:8]) + rng.normal(0, 3, 3)
             u = tuple(u.clip(-robot.force_limit, robot.force_limit).tolist())
-            assert dynamics.keeps_grip(robot, dynamics.held_contact(robot, tuple(x), u, 0.02))
+            assert min(robot.held(tuple(x), u, 0.02)[1]) >= 0
             x, found = np.array(exact.step(u)), np.array(simulator.step(u))
         errors.append(np.hypot(*(found - x)[:2]))
         np.testing.assert_allclose(found[[2, 3, 8, 9, 10]], x[[2, 3, 8, 9, 10]], atol=10 * most)
-        np.testing.assert_allclose(simulator.floor_force(), dynamics.contact(robot, x, u), atol=2 * most * robot.weight)
+        np.testing.assert_allclose(simulator.floor_force(), robot.contact(x, u), atol=2 * most * robot.weight)
     assert max(errors) < most  # m; measured in 20: MuJoCo 2e-4, PyBullet, which is of first order, 9e-4
 
 
@@ -257,7 +254,7 @@ def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
     assert episode.success
     assert controller.plan.is_optimal
     assert episode.cost == pytest.approx(controller.plan.cost, rel=1e-3)
-    limits = dynamics.limits(robot, controller.plan.trajectory.x[:-1], controller.plan.trajectory.u)
+    limits = robot.limits(controller.plan.trajectory.x[:-1], controller.plan.trajectory.u)
     assert np.min(limits) >= 0
 
 
@@ -301,7 +298,7 @@ def test_a_free_heading_costs_nothing(robot):
 
 def test_what_knows_no_wheels_says_so(robot):
     task = make_task("stabilize", "omni")
-    with pytest.raises(ValueError, match="pushes are forces Fx, Fy, which a robot with wheels does not have"):
+    with pytest.raises(ValueError, match="pushes add to an action Fx, Fy, which Omni does not have"):
         BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
     with pytest.raises(ValueError, match="omni has three wheels, and neither a frame nor mirror images"):
         PolicySpec.of(task, robot="omni", frame="orbit")

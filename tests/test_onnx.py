@@ -8,7 +8,7 @@ from builders import random_policy, task_and_robot
 
 from ballbot_gym.engines import default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import named_robot
 from ballbot_train.commands.export import export
 from ballbot_train.onnx_export import export_onnx
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_policy, save_policy

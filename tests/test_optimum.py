@@ -8,8 +8,7 @@ import casadi
 from ballbot_baselines import Backoff, LqrController, find_optimum, plan_to_track
 from ballbot_baselines.optimum import find as optimum_module
 from ballbot_baselines.solvers.ocp import FEASIBLE, Ocp, OcpSolver
-from ballbot_gym import dynamics
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -36,7 +35,7 @@ def optimum_of():
 def test_a_plan_is_an_episode_of_its_cost_that_obeys_the_limits_and_ends_at_the_goal(task, optimum_of, params):
     optimum, (x0, c) = optimum_of(task), episode(task)
     trajectory = optimum.trajectory
-    after = dynamics.step(params, trajectory.x[:-1], trajectory.u, task.control_dt)
+    after = params.step(trajectory.x[:-1], trajectory.u, task.control_dt)
     np.testing.assert_allclose(after, trajectory.x[1:], atol=1e-6)
     np.testing.assert_array_equal(trajectory.x[0], x0)
     np.testing.assert_allclose(np.diff(trajectory.t), task.control_dt, rtol=1e-9)
@@ -84,7 +83,7 @@ def simulated_cost(task, params, x, forces):
     cost = 0.0
     for u in forces:
         cost += task.cost(x, u, ()) * task.control_dt
-        x = dynamics.step(params, x, u, task.control_dt)
+        x = params.step(x, u, task.control_dt)
     return cost
 
 

@@ -9,7 +9,6 @@ from ballbot_baselines.paper import problems
 from ballbot_baselines.paper.collocation import Guess, collocation_error, solve
 from ballbot_baselines.paper.problems import PAPER_PROBLEMS, between_states, hermite_guess, state
 from ballbot_baselines.solvers import guess as guesses
-from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
@@ -108,9 +107,9 @@ def test_plans_satisfy_hermite_simpson_between_knots(plan_of, params):
     for name in PAPER_PROBLEMS:
         trajectory = plan_of(name).trajectory
         x, u, h = trajectory.x, trajectory.u, np.diff(trajectory.t)[:, None]
-        f = dynamics.derivative(params, x, u)
+        f = params.derivative(x, u)
         middle = 0.5 * (x[:-1] + x[1:]) + h / 8 * (f[:-1] - f[1:])
-        f_middle = dynamics.derivative(params, middle, 0.5 * (u[:-1] + u[1:]))
+        f_middle = params.derivative(middle, 0.5 * (u[:-1] + u[1:]))
         defect = x[1:] - x[:-1] - h / 6 * (f[:-1] + 4 * f_middle + f[1:])
         assert np.abs(defect).max() < 1e-6
         times = 0.5 * (trajectory.t[1:] + trajectory.t[:-1])
@@ -139,7 +138,7 @@ def test_collocation_error_is_zero_for_a_motion_that_is_a_cubic(params):
     t = np.linspace(0, 1, 6)
     x = np.zeros((6, 8))
     x[:, 0], x[:, 4] = 2 + 3 * t, 3.0  # upright at constant speed
-    moving = Trajectory(t, x, np.zeros((6, 2)), xdot=dynamics.derivative(params, x, np.zeros((6, 2))))
+    moving = Trajectory(t, x, np.zeros((6, 2)), xdot=params.derivative(x, np.zeros((6, 2))))
     assert collocation_error(params, moving) < 1e-12
 
 
@@ -174,7 +173,7 @@ def test_guess_along_an_accelerating_path_is_the_motion_itself(params):
     inside = slice(20, -20)  # differences and smoothing are one-sided at the ends
     np.testing.assert_allclose(x[inside, 2], np.arctan(a / params.gravity), rtol=1e-9)
     np.testing.assert_allclose(u[inside], np.tile([params.total_mass * a, 0], (len(u[inside]), 1)), atol=1e-8)
-    residual = dynamics.derivative(params, x[:-1], u)[inside] - np.gradient(x, dt, axis=0)[:-1][inside]
+    residual = params.derivative(x[:-1], u)[inside] - np.gradient(x, dt, axis=0)[:-1][inside]
     assert np.abs(residual).max() < 1e-8
 
 

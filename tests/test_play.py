@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_gym import certified, dynamics
+from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.policy_files import BEST, SHIPPED
@@ -82,10 +82,10 @@ def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
         pytest.importorskip("pybullet")
     playground = play(episode="rest", physics=physics)
     playground.push(60.0, 30.0)
-    pushed = dynamics.pushed(params, (0.0,) * 8, (60.0, 30.0))
+    pushed = params.pushed((0.0,) * 8, (60.0, 30.0))
     assert playground.main.x == pytest.approx(pushed)
     playground.step()
-    expected = dynamics.step(params, pushed, playground.main.force, 0.02)
+    expected = params.step(pushed, playground.main.force, 0.02)
     assert playground.main.x == pytest.approx(expected, abs=2e-3)
     playground.push(1e300, 1e300)  # which is cut
     playground.step()

@@ -17,7 +17,7 @@ from browser import start_chromium
 
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller

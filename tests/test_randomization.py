@@ -10,7 +10,7 @@ import torch
 
 from ballbot_gym import Randomization
 from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.randomization import TRACKS, normals
+from ballbot_gym.robot import TRACKS, normals
 from ballbot_gym.vector import BallbotVectorEnv
 
 ROBOTS = Randomization(body_mass=(0.8, 1.3), ball_mass=(0.5, 2.0), com_height=(0.9, 1.1), inertia=(0.7, 1.4))

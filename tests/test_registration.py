@@ -17,8 +17,7 @@ from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import TASKS, Task, certified, files, named_robot, register_robot, register_task
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
-from ballbot_gym.params import URDF_PATH, BallbotParams, UrdfError
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS, URDF_PATH, UrdfError, read_urdf
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.new import files_of
@@ -298,7 +297,7 @@ def test_a_payload_on_a_fixed_joint_is_refused(light):
     with pytest.raises(UrdfError, match=r"link 'payload' has a mass.*add its mass.*to link 'body'"):
         register_robot("laden", light)
     light.write_text(text.replace("</robot>", '<link name="camera"/></robot>'))
-    assert BallbotParams.from_urdf(light).body_mass == 10.0
+    assert read_urdf(light).body_mass == 10.0
 
 
 @pytest.mark.parametrize(

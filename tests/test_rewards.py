@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ballbot_gym import certified
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 

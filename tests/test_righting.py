@@ -12,7 +12,7 @@ from ballbot_baselines import LqrController, NmpcController, TrajoptController, 
 from ballbot_baselines.optimum import certification
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.ocp import FEASIBLE, OcpSolver
-from ballbot_gym import dynamics
+from ballbot_gym.robot import tilt
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 
@@ -55,10 +55,10 @@ def test_members_obey_the_dynamics_the_force_limit_and_the_margins(params):
     assert {member.side for member in members} == {-1, 0, 1}
     for member in members:
         np.testing.assert_array_equal(member.x[0], x0)
-        after = dynamics.step(params, member.x[:-1], member.u, task.control_dt)
+        after = params.step(member.x[:-1], member.u, task.control_dt)
         np.testing.assert_allclose(after, member.x[1:], atol=1e-12)
         assert np.abs(member.u).max() <= params.force_limit
-        assert dynamics.tilt(member.x).max() <= task.max_tilt
+        assert tilt(member.x).max() <= task.max_tilt
         assert np.abs(member.x[member.righted, 2:4]).max() < math.radians(10)
 
 

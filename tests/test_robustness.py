@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders import stress_result as result
 
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization
 from ballbot_train.evaluation import benchmark, robustness
 from ballbot_train.evaluation.results import leaderboard, summarize, write_results
 from ballbot_train.evaluation.robustness import NONE, STRESSES

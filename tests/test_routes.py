@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks.weave import split_constants
 from ballbot_train.evaluation import fresh
 from ballbot_train.learning import routing

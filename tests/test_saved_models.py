@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 
 from ballbot_gym import TASKS, Stabilize, certified, ops
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_train import BallbotVecEnv, RegretCallback
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.evaluate import evaluate

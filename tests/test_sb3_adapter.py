@@ -8,7 +8,6 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-from ballbot_gym import dynamics
 from ballbot_gym.seeding import spawned
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning.sb3 import BallbotVecEnv
@@ -41,7 +40,7 @@ def test_terminal_observation_is_the_last_of_the_old_episode_and_the_returned_on
         expected, *_ = same.step(np.zeros((4, 2)))
     assert done.all()
     np.testing.assert_array_equal(observation, expected)
-    end = dynamics.step(same.params, x.unbind(0), (0 * x[0], 0 * x[0]), 0.02, 2)
+    end = same.params.step(x.unbind(0), (0 * x[0], 0 * x[0]), 0.02, 2)
     terminal = np.stack([info["terminal_observation"] for info in infos])
     np.testing.assert_array_equal(terminal, np.stack(same.task.observe(end, ()), axis=-1))
     assert np.abs(observation - terminal).max() > 0.1

@@ -10,8 +10,7 @@ from stable_baselines3 import PPO
 from ballbot_gym import seeding
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import default_params
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import BallbotVecEnv

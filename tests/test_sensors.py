@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from ballbot_baselines import StateFromSensors
-from ballbot_gym import certified, dynamics, omni, sensors
+from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.randomization import TRACKS
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import TRACKS, named_robot, omni, sensors
 from ballbot_gym.rollout import rollout
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.controllers import make_controller
@@ -27,7 +26,7 @@ def random_motion(robot, rng):
     """A state, the wheels' forces, and the state a control step later."""
     x = tuple((np.array([1, 1, 0.4, 0.4, 1, 1, 1, 1, 3, 1, 3]) * rng.uniform(-1, 1, 11)).tolist())
     u = tuple(rng.uniform(-20, 20, 3).tolist())
-    return x, u, dynamics.step(robot, x, u, DT)
+    return x, u, robot.step(x, u, DT)
 
 
 def body(x):
@@ -47,7 +46,7 @@ def test_standing_still_only_gravity_is_measured(robot):
 def test_the_gyroscope_measures_how_the_body_turns_and_the_accelerometer_how_its_centre_speeds_up(robot, rng):
     def rate(of, x, u, h=1e-4):
         """Of a function of the state, by differences along the motion."""
-        slope = h * np.array(dynamics.derivative(robot, x, u))
+        slope = h * np.array(robot.derivative(x, u))
         return (of(x + slope) - of(x - slope)) / (2 * h)
 
     def speed(x):
@@ -73,7 +72,7 @@ def test_readings_are_means_over_the_control_step(robot, rng):
     x, u, after = random_motion(robot, rng)
     read, fine, parts = sensors.mean(robot, x, u, after, DT), x, []
     for _ in range(20):
-        later = dynamics.step(robot, fine, u, DT / 20)
+        later = robot.step(fine, u, DT / 20)
         parts.append(sensors.mean(robot, fine, u, later, DT / 20))
         fine = later
     expected = np.array(parts)

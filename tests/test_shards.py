@@ -13,7 +13,7 @@ import pytest
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import ROBOTS, named_robot, robot_name
+from ballbot_gym.robot import ROBOTS, named_robot, robot_name
 from ballbot_train import shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.learning.datasets import command_of, load_demos

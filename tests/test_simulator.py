@@ -8,11 +8,9 @@ import numpy as np
 import pybullet
 import pytest
 
-from ballbot_gym import dynamics
-from ballbot_gym.engines import make_simulator
+from ballbot_gym.engines import bullet, make_simulator
 from ballbot_gym.engines.bullet import BulletSimulator
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import ROBOTS, named_robot
+from ballbot_gym.robot import ROBOTS, named_robot, urdf_text
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
 FORCE = (60.0, -40.0)
@@ -93,8 +91,7 @@ def test_inertias_that_no_body_can_have_are_refused(params):
 
 
 def test_bullet_refuses_a_robot_whose_numbers_it_does_not_hold(params, monkeypatch):
-    written = BallbotParams.to_urdf
-    monkeypatch.setattr(BallbotParams, "to_urdf", lambda self: written(self).replace('"15.0"', '"fifteen"'))
+    monkeypatch.setattr(bullet, "urdf_text", lambda robot: urdf_text(robot).replace('"15.0"', '"fifteen"'))
     with pytest.raises(RuntimeError, match=r"PyBullet took \(0.0"):
         BulletSimulator(params, 0.02)
 
@@ -110,16 +107,16 @@ def test_a_robot_that_is_replaced_moves_as_one_made_anew(name, change, physics):
         simulator.reset(GENTLE)
         ends.append([simulator.step((5.0, -3.0)) for _ in range(5)])
     assert ends[0] == ends[1]
-    with pytest.raises(ValueError, match="rolls"):
+    with pytest.raises(ValueError, match="this simulator is of a"):
         simulators[0].set_params(named_robot("rolling" if name == "paper" else "paper"))
     for simulator in simulators:
         simulator.close()
 
 
 def test_bullet_conserves_energy_to_first_order(params):
-    energy = dynamics.energy(params, GENTLE)
+    energy = params.energy(GENTLE)
     steps = (2e-3, 1e-3, 5e-4)
-    drift = [abs(dynamics.energy(params, held(params, "bullet", GENTLE, (0.0, 0.0), 0.5, dt)) - energy) for dt in steps]
+    drift = [abs(params.energy(held(params, "bullet", GENTLE, (0.0, 0.0), 0.5, dt)) - energy) for dt in steps]
     assert drift[1] < 0.01 * energy  # measured 0.53 J of 117 J at 1 ms
     assert 1.7 < drift[0] / drift[1] < 2.3
     assert 1.7 < drift[1] / drift[2] < 2.3

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballbot_gym import TASKS, BallbotEnv, Randomization, dynamics, machine_code, ops, step_code, traced
+from ballbot_gym import TASKS, BallbotEnv, Randomization, machine_code, ops, step_code, traced
 from ballbot_gym.engines.closed_form import Rk4Simulator
+from ballbot_gym.robot import tilt
+from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Stabilize
-from ballbot_gym.tasks.transition import outcome
 
 needs_compiler = pytest.mark.skipif(machine_code.compiler() is None, reason="no C compiler")
 
@@ -99,7 +100,7 @@ def test_goals_limits_and_ends_are_those_of_python(task):
         env._judge.c[:] = c
         steps, kept = env.task.steps - (i % 3 > 0), (0.0, -1.0)[i % 7 == 0]
         did = outcome(env.task, before, force, after, c, steps, (kept,))
-        assert env._judge.judge(before, force, after, steps, kept) == (*did, dynamics.tilt(after))
+        assert env._judge.judge(before, force, after, steps, kept) == (*did, tilt(after))
         assert env._judge.seen.tolist() == list(env.task.observe(after, c))
         ends.add(did.success)
     assert ends == {1.0, 0.0}
@@ -113,7 +114,7 @@ def test_numbers_that_are_not_finite_are_left_to_python(params):
     good, bad = (0.1,) * 8, (0.1,) * 4 + (math.inf,) + (0.1,) * 3
     for x, finite in ((good, True), (bad, False)):
         simulator.reset(x)
-        np.testing.assert_array_equal(simulator.step((1.0, 2.0)), dynamics.step(params, x, (1.0, 2.0), 0.02, 2))
+        np.testing.assert_array_equal(simulator.step((1.0, 2.0)), params.step(x, (1.0, 2.0), 0.02, 2))
         assert (simulator._code.check[0] == 0) == finite
     assert judge.judge(good, (1.0, 2.0), bad, 1, 0.0) is None
     assert judge.judge(good, (1.0, 2.0), good, 1, 0.0) is not None

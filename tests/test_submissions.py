@@ -9,7 +9,7 @@ import pytest
 
 from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_baselines.solvers.riccati import discrete_lqr
-from ballbot_gym import certified, dynamics, files, named_robot
+from ballbot_gym import certified, files, named_robot
 from ballbot_gym.engines import PHYSICS, installed_physics, make_simulator
 from ballbot_gym.env import make_task
 from ballbot_train import evaluate
@@ -127,7 +127,7 @@ def test_an_end_that_is_none_is_refused(forge, submitted):
         SubmissionError, match=r"episode 1, step \d+: the recording stops here, and the episode has not"
     ):
         forge(**shorter)
-    x = dynamics.step(named_robot("paper"), honest.states[-1:], np.zeros((1, 2)), 0.02)
+    x = named_robot("paper").step(honest.states[-1:], np.zeros((1, 2)), 0.02)
     later = {
         "lengths": honest.lengths + [0, 1],
         "states": np.concatenate([honest.states, x]),
@@ -272,7 +272,7 @@ def test_a_costate_is_the_slope_of_the_cost_of_a_motion_that_is_steered_back():
     states, forces = [np.array([1e-3, 0, 0, 1e-4, 0, 0, 0, 0])], []
     for _ in range(task.steps):
         forces.append(-k @ states[-1])
-        states.append(dynamics.step(params, states[-1][None], forces[-1][None], task.control_dt, 4)[0])
+        states.append(params.step(states[-1][None], forces[-1][None], task.control_dt, 4)[0])
     slopes = costates(task, params, np.array(states), np.array(forces) / params.force_limit, np.zeros(0))
     expected = 2 * p @ states[10]
     np.testing.assert_allclose(slopes[9], expected, atol=1e-3 * np.abs(expected).max())

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from ballbot_gym import dynamics
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import steady_orbit
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -30,7 +29,7 @@ def test_a_mirror_image_moves_as_the_mirror_image_and_costs_the_same(name, index
     signs = np.array(mirror.state), np.array(mirror.constants or 1), np.array(mirror.action)
     for x, c, u in moments(task, params, rng):
         mx, mc, mu = x * signs[0], c * signs[1], u * signs[2]
-        after, mirrored = (dynamics.step(params, tuple(a), tuple(b), 0.02, 2) for a, b in ((x, u), (mx, mu)))
+        after, mirrored = (params.step(tuple(a), tuple(b), 0.02, 2) for a, b in ((x, u), (mx, mu)))
         np.testing.assert_allclose(np.array(after) * signs[0], mirrored, rtol=1e-12, atol=1e-12)
         assert task.cost(mx, mu, mc) == pytest.approx(task.cost(x, u, c), rel=1e-12)
         for function in (task.limits, task.goal):

@@ -5,10 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from ballbot_gym import dynamics
 from ballbot_gym.paths import sides_passed
 from ballbot_gym.tasks.base import Reference
-from ballbot_gym.tasks.orbit import Orbit, orbit_speed, orbit_tilt, steady_orbit
+from ballbot_gym.tasks.orbit import Orbit, orbit_tilt, steady_orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave, split_constants
@@ -226,7 +225,7 @@ def test_reference_is_a_motion_that_the_robot_makes(task, params):
         assert isinstance(reference, Reference)
         assert reference.x.shape == (n, 8)
         assert reference.u.shape == (n, 2)
-        after = dynamics.step(params, reference.x, reference.u, task.control_dt)
+        after = params.step(reference.x, reference.u, task.control_dt)
         if reference.closed:
             # A round is rounded to whole steps, and steady_orbit neglects the axial inertia: over 300 episodes 9e-4 was
             # measured in positions and leans, 8e-2 in rates.
@@ -242,7 +241,7 @@ def test_reference_is_a_motion_that_the_robot_makes(task, params):
 def test_orbit_tilt_inverts_orbit_speed(params):
     for radius in (0.9, 1.0, 2.0, 3.0):
         for tilt in np.radians([5, 10, 30, 45]):
-            assert orbit_tilt(params, radius, orbit_speed(params, radius, tilt)) == pytest.approx(tilt, abs=1e-9)
+            assert orbit_tilt(params, radius, params.steady_speed(radius, tilt)) == pytest.approx(tilt, abs=1e-9)
 
 
 def orbit_accelerations(params, radius, speed):
@@ -253,7 +252,7 @@ def orbit_accelerations(params, radius, speed):
     ahead, behind = (steady_orbit(params, radius, speed, bearings + s * h)[0] for s in (1, -1))
     along = (ahead - behind) / (2 * h) * speed / radius
     np.testing.assert_allclose(x[:, 4:], along[:, :4], atol=1e-6)  # velocities are those of the motion
-    return dynamics.derivative(params, x, u)[:, 4:], along[:, 4:]
+    return params.derivative(x, u)[:, 4:], along[:, 4:]
 
 
 ORBITS = [(1.063, 4.0), (1.5, -4.0), (3.0, 2.3), (3.0, 5.97), (1.0, 4.54)]

@@ -18,8 +18,7 @@ from ballbot_gym import certified
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
-from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS, Randomization
+from ballbot_gym.robot import ROBOT_FACTORS, TRACKS, Randomization, default_params
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate

@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 import torch
 
 from ballbot_gym import batch as batch_module
-from ballbot_gym import counter_rng, dynamics
+from ballbot_gym import counter_rng
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.tasks import TASKS
@@ -260,7 +260,7 @@ def casadi_gradient(task, params, x0, gain, forces):
     step = casadi.Function(
         "step",
         [x, w],
-        [dynamics.step(params, x, u, task.control_dt), task.cost(x, u, casadi.SX(0, 1)) * task.control_dt],
+        [params.step(x, u, task.control_dt), task.cost(x, u, casadi.SX(0, 1)) * task.control_dt],
     )
     w_all = casadi.MX.sym("w", 2, len(forces))
     _, costs = step.mapaccum(len(forces))(casadi.DM(x0.numpy()), w_all)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from browser import start_chromium
 
-from ballbot_gym.drawing import Drawing, GroundPath, Robot
+from ballbot_gym.drawing import Drawing, Drawn, GroundPath
 from ballbot_gym.drawing.page import moment
 from ballbot_gym.drawing.viewer import Viewer
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import named_robot
 from ballbot_gym.tasks.marker import Marker
 
 pytest.importorskip("websockets")
@@ -34,8 +34,8 @@ def viewer():
 
 
 def test_a_moment_says_where_robots_arrows_paths_and_markers_are(params):
-    ghost = Robot(STATE + 1, "#c0392b", alpha=0.4, label="LQR fell")
-    robot = Robot(STATE, "#e08a00", u=np.array([200.0, np.inf]), push=np.array([0.0, 100.0]))
+    ghost = Drawn(STATE + 1, "#c0392b", alpha=0.4, label="LQR fell")
+    robot = Drawn(STATE, "#e08a00", u=np.array([200.0, np.inf]), push=np.array([0.0, 100.0]))
     path = GroundPath(np.array([[0, 0], [1, 0], [1, 1.0]]), "#e08a00")
     shown = moment(Drawing(params, (ghost, robot), (path,), (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)),)))
     assert json.loads(json.dumps(shown, allow_nan=False))["markers"][0]["position"] == [1.0, 0.0]
@@ -49,21 +49,21 @@ def test_a_moment_says_where_robots_arrows_paths_and_markers_are(params):
 def test_a_robot_with_wheels_has_them_and_a_heading():
     omni, x = named_robot("omni"), np.zeros(11)
     x[8] = 0.7
-    shown = moment(Drawing(omni, (Robot(x),)))
+    shown = moment(Drawing(omni, (Drawn(x),)))
     assert (shown["robots"][0]["yaw"], shown["look"]["robot"]["wheel_radius"]) == (0.7, omni.wheels.radius)
 
 
 def test_everybody_sees_the_newest_moment_and_those_who_come_later_too(viewer, params):
     with Visitor(viewer.port) as first:
         wait_for(lambda: viewer.is_watched)
-        viewer.draw(Drawing(params, (Robot(STATE),)))
+        viewer.draw(Drawing(params, (Drawn(STATE),)))
         with Visitor(viewer.port) as second:
             for visitor in (first, second):
                 wait_for(lambda visitor=visitor: "moment" in visitor.seen)
                 assert visitor.seen["moment"]["robots"][0]["x"] == [0.5, -0.2, 0.3, -0.4]
             seen = first.moments
-            viewer.draw(Drawing(params, (Robot(STATE),)))  # the same
-            viewer.draw(Drawing(params, (Robot(STATE + 1),)))
+            viewer.draw(Drawing(params, (Drawn(STATE),)))  # the same
+            viewer.draw(Drawing(params, (Drawn(STATE + 1),)))
             wait_for(lambda: second.seen["moment"]["robots"][0]["x"][0] == 1.5)
             assert first.moments <= seen + 1
     wait_for(lambda: not viewer.is_watched)
@@ -79,7 +79,7 @@ def test_a_client_that_reads_nothing_holds_up_nobody(viewer, params):
         stuck.sendall(f"{head}{key}\r\n".encode())
         wait_for(lambda: len(viewer._clients) == 2)
         for k in range(100):  # 20 MB
-            viewer.draw(Drawing(params, (Robot(STATE + k),), path))
+            viewer.draw(Drawing(params, (Drawn(STATE + k),), path))
         wait_for(lambda: other.seen.get("moment", {"robots": [{"x": [0]}]})["robots"][0]["x"][0] == 99.5)
         began = time.monotonic()
         viewer.close()  # which does not wait for it either

@@ -8,7 +8,7 @@ import torch
 from resuming import goes_on_as_if_never_stopped
 
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robot import named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning.learners import LEARNERS, shac
 from ballbot_train.policy import load_network

@@ -14,14 +14,23 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_gym import dynamics, files
+from ballbot_gym import files
 from ballbot_gym.certified import cache, version
 from ballbot_gym.checks import shown
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization, track_of
 from ballbot_gym.registry import name_of
-from ballbot_gym.robots import PAPER, checked_robot, file_name, named_robot, robot_name, short_name
+from ballbot_gym.robot import (
+    PAPER,
+    Randomization,
+    Robot,
+    checked_robot,
+    file_name,
+    named_robot,
+    robot_name,
+    short_name,
+    substeps_for,
+    track_of,
+)
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -79,17 +88,15 @@ class EvaluationSet:
         chosen = {name: getattr(self, name)[:episodes] for name in _PER_EPISODE}
         return EvaluationSet(**chosen, trajectories=self.trajectories[:episodes])
 
-    def save(
-        self, task: Task, path: Path, robot: str | BallbotParams, randomization: Randomization = Randomization()
-    ) -> Path:
+    def save(self, task: Task, path: Path, robot: str | Robot, randomization: Randomization = Randomization()) -> Path:
         """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""
         params, varied = checked_robot(robot), randomization.moves_optima
         names = _PER_EPISODE if varied else _PER_EPISODE[:-2]
-        trajectories = self.trajectories[:_FEW] if varied or params.wheels is not None else self.trajectories
+        trajectories = self.trajectories[:_FEW] if varied or params.LONG_EQUATIONS else self.trajectories
         arrays = {
             "benchmark": np.array(version.BENCHMARK),
             "task": np.array(task.problem()),
-            **({} if params == named_robot(PAPER) else {"robot": np.array(repr(params))}),
+            **({} if params == named_robot(PAPER) else {"robot": np.array(params.record())}),
             **({"randomization": np.array(repr(randomization))} if varied else {}),
             **{name: getattr(self, name) for name in names},
             "lengths": np.array([len(trajectory.u) for trajectory in trajectories]),
@@ -109,7 +116,7 @@ def path_of(task: Task, robot: str = PAPER, track: str = "") -> Path:
 
 def load(
     task: str | Task,
-    robot: str | BallbotParams,
+    robot: str | Robot,
     path: str | Path | None = None,
     episodes: Iterable[int] | None = None,
     randomization: Randomization = Randomization(),
@@ -157,7 +164,7 @@ def load(
 
 
 def from_cache(
-    task: Task, params: BallbotParams, episodes: Iterable[int], randomization: Randomization = Randomization()
+    task: Task, params: Robot, episodes: Iterable[int], randomization: Randomization = Randomization()
 ) -> EvaluationSet | None:
     """What the user's cache has of some episodes; None where one is missing, or does not move or cost as it did.
 
@@ -195,7 +202,7 @@ def _version(path: Path) -> tuple[Path, int, int]:
 
 @lru_cache(maxsize=16)
 def _read(
-    versions: tuple[tuple[Path, int, int], ...], task: Task, params: BallbotParams, randomization: Randomization
+    versions: tuple[tuple[Path, int, int], ...], task: Task, params: Robot, randomization: Randomization
 ) -> EvaluationSet:
     """The sets of some files in their present versions as one. Of several files each has all its trajectories.
 
@@ -218,7 +225,7 @@ def _read(
     return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
 
 
-def _arrays_of(path: Path, task: Task, params: BallbotParams, randomization: Randomization) -> dict[str, np.ndarray]:
+def _arrays_of(path: Path, task: Task, params: Robot, randomization: Randomization) -> dict[str, np.ndarray]:
     """What a file holds that `EvaluationSet.save` wrote for this very problem."""
     try:
         arrays = files.read_npz(path)
@@ -229,9 +236,9 @@ def _arrays_of(path: Path, task: Task, params: BallbotParams, randomization: Ran
             raise ValueError(f"it has no array {', '.join(missing)}")
         # sets that were written before there was a version are of the first
         version.check(str(arrays.get("benchmark", "1")), "it", "compute it again with ballbot certify")
-        made_for = [str(arrays["task"]), str(arrays.get("robot", repr(named_robot(PAPER))))]
+        made_for = [str(arrays["task"]), str(arrays.get("robot", named_robot(PAPER).record()))]
         made_for.append(str(arrays.get("randomization", repr(Randomization()))))
-        for made, wanted in zip(made_for, (task.problem(), repr(params), repr(randomization)), strict=True):
+        for made, wanted in zip(made_for, (task.problem(), params.record(), repr(randomization)), strict=True):
             if made != wanted:
                 raise CertificateError(f"{path} was computed for {made}, not for {wanted}")
         return _checked(task, params, arrays)
@@ -241,7 +248,7 @@ def _arrays_of(path: Path, task: Task, params: BallbotParams, randomization: Ran
         raise CertificateError(f"{path} is no evaluation set: {error}") from error
 
 
-def _command(task: Task, params: BallbotParams, robot: str, file: bool, track: str) -> str:
+def _command(task: Task, params: Robot, robot: str, file: bool, track: str) -> str:
     """How the set of a task and a robot is computed, in words."""
     name = name_of(task)
     first = [] if name else [f"ballbot_gym.register_task({type(task).__name__}) gives the task a name"]
@@ -260,7 +267,7 @@ def _command(task: Task, params: BallbotParams, robot: str, file: bool, track: s
     )
 
 
-def _holds(arrays: Mapping[str, np.ndarray], task: Task, params: BallbotParams, randomization: Randomization) -> bool:
+def _holds(arrays: Mapping[str, np.ndarray], task: Task, params: Robot, randomization: Randomization) -> bool:
     """Whether the trajectories, of the first episodes, move, cost and keep the limits as when they were found."""
     dt, lengths, u = task.control_dt, arrays["lengths"], arrays["u"]
     number = np.repeat(np.arange(len(lengths)), lengths)
@@ -271,13 +278,13 @@ def _holds(arrays: Mapping[str, np.ndarray], task: Task, params: BallbotParams, 
     robot = randomization.robot(params, tuple(arrays["drawn"][number].T)) if randomization.moves_optima else params
     known = arrays["costs"][: len(lengths)]
     with np.errstate(all="ignore"):  # of damaged files
-        moved = np.abs(dynamics.step(robot, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
+        moved = np.abs(robot.step(before, u, dt, substeps_for(dt)) - after) <= _SAME
         found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, began), len(u)), len(known))
         kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, ended))
         return bool(moved.all() and (np.abs(found - known) <= _SAME * known).all() and kept)
 
 
-def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _checked(task: Task, params: Robot, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of a set; raises a ValueError that names the one whose shape or values make no sense."""
     n = arrays["costs"].size
     if n == 0:

@@ -20,14 +20,13 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import machine_code, traced
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
 
 _MOST_DRAWS = 20
 
 
-def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def episode(task: Task, params: Robot, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Initial state (8,) and constants (nc,) of episode `index` of a task's evaluation set, the same on every machine.
 
     A later draw takes the place of one from which a robot with limited friction cannot reach the goal.
@@ -37,7 +36,7 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
 
 
 def starts(
-    task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()
+    task: Task, params: Robot, index: int, randomization: Randomization = Randomization()
 ) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[float, ...]]]:
     """Initial state, constants and what a randomization that moves optima draws, of each draw of `episode`.
 
@@ -51,7 +50,7 @@ def starts(
         yield *episode(task, params, index, draw), drawn
 
 
-def folder(task: Task, params: BallbotParams, randomization: Randomization = Randomization()) -> Path:
+def folder(task: Task, params: Robot, randomization: Randomization = Randomization()) -> Path:
     """Where the optima of a problem are kept: in $BALLBOT_OPTIMA, or the folder `optima` of the user's cache.
 
     Raises:
@@ -71,16 +70,22 @@ def folder(task: Task, params: BallbotParams, randomization: Randomization = Ran
     return base / f"{type(task).__name__}-{_digest(task, params, randomization)}"
 
 
-def path(task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()) -> Path:
+def path(task: Task, params: Robot, index: int, randomization: Randomization = Randomization()) -> Path:
     """Where the optimum of an episode is kept, as an `EvaluationSet` of this episode alone."""
     return folder(task, params, randomization) / f"{index:06d}.npz"
 
 
 @lru_cache(maxsize=64)
-def _digest(task: Task, params: BallbotParams, randomization: Randomization) -> str:
+def _digest(task: Task, params: Robot, randomization: Randomization) -> str:
     """Of all that an optimum depends on, as 24 hexadecimal digits."""
     varied = [repr(randomization)] if randomization.moves_optima else []
-    parts = [task.id, task.problem(), repr(params), *map(_version, ("ballbot-gym", "casadi")), _formulas(task, params)]
+    parts = [
+        task.id,
+        task.problem(),
+        params.record(),
+        *map(_version, ("ballbot-gym", "casadi")),
+        _formulas(task, params),
+    ]
     parts += varied
     for index in range(2):
         x, c = episode(task, params, index)
@@ -96,7 +101,7 @@ def _version(package: str) -> str:
         return ""
 
 
-def _formulas(task: Task, params: BallbotParams) -> str:
+def _formulas(task: Task, params: Robot) -> str:
     """What the task computes, as text."""
 
     def compute(x: tuple, u: tuple, c: tuple, z_constants: tuple, z_state: tuple) -> tuple[Any, ...]:

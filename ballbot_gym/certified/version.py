@@ -20,7 +20,7 @@ def digest() -> str:
     """Digest of the four shipped tasks with the paper's robot: episodes, costs, limits, observations and optima."""
     from ballbot_gym import certified, identity
     from ballbot_gym.env import make_task
-    from ballbot_gym.robots import PAPER, named_robot
+    from ballbot_gym.robot import PAPER, named_robot
     from ballbot_gym.tasks import SHIPPED
 
     robot, parts = named_robot(PAPER), []

@@ -6,14 +6,15 @@ that draws.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
+from ballbot_gym.robot.shapes import DARK
 from ballbot_gym.tasks.marker import Marker
 
-BALL = "#292e3b"
+BALL = DARK
 """Colour of the ball."""
 BODY = "#d97706"
 """Colour of a body that stands for no controller."""
@@ -33,8 +34,8 @@ LEAST_FORCE = 2.0
 
 
 @dataclass(frozen=True)
-class Robot:
-    """A ballbot: state x (8,), colour "#rrggbb", force u (2,), N, or None for no arrow, and opacity, less than 1 for ghosts.
+class Drawn:
+    """A robot: state x (n,), colour "#rrggbb", force u (2,), N, or None for no arrow, and opacity, less than 1 for ghosts.
 
     `push` (2,), N·s, is an impulse on the body's centre of mass, drawn as an arrow, or None. `label` is what a live page
     writes above it.
@@ -63,15 +64,15 @@ class GroundPath:
 class Drawing:
     """One moment. The robot that matters most is the last one. Of it a renderer's camera keeps `centre` in view."""
 
-    params: BallbotParams
-    robots: tuple[Robot, ...]
+    params: Robot
+    robots: tuple[Drawn, ...]
     paths: tuple[GroundPath, ...] = ()
     markers: tuple[Marker, ...] = ()
 
     @property
     def centre(self) -> np.ndarray:
         """(2,) where the last robot is, m; the origin if there is no robot."""
-        return self.robots[-1].x[:2] if self.robots else np.zeros(2)
+        return self.params.position(self.robots[-1].x) if self.robots else np.zeros(2)
 
     @property
     def lines(self) -> tuple[GroundPath, ...]:
@@ -96,7 +97,7 @@ class Pose(NamedTuple):
     """(3,) upper end of the body."""
 
 
-def pose(params: BallbotParams, x: np.ndarray) -> Pose:
+def pose(params: Any, x: np.ndarray) -> Pose:
     """The pose of a ballbot in state x (8,). γ turns the body about the y axis, then θ about the turned −x axis."""
     ball = np.array([x[0], x[1], params.ball_radius])
     gamma, theta = x[2], x[3]
@@ -105,7 +106,7 @@ def pose(params: BallbotParams, x: np.ndarray) -> Pose:
     return Pose(ball, body, body + params.body_length / 2 * axis)
 
 
-def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
+def arrows(place: Pose, robot: Drawn) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
     """Colour, and start and end (3,), m, of the arrows of a robot's force and push, where there is one to draw.
 
     The forces of three wheels have no one direction, and get none.

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import drawing, files
-from ballbot_gym.drawing import Drawing, Robot
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.drawing import Drawing, Drawn
+from ballbot_gym.robot import Ballbot, Robot
 
 _ASSETS = Path(__file__).parent / "assets"
 _FARTHEST = 1e9  # of a number that is sent
@@ -38,11 +38,17 @@ def page_html(data: str, playground: str = "const playground = new Page();", liv
     return shell.replace("<!-- scripts -->", "\n".join(f"<script>{script}</script>" for script in scripts))
 
 
-def look(params: BallbotParams) -> dict[str, Any]:
-    """How scene.js draws a robot."""
+def look(params: Robot) -> dict[str, Any]:
+    """How scene.js draws a robot.
+
+    Raises:
+        ValueError: it is no ballbot.
+    """
+    if not isinstance(params, Ballbot):
+        raise ValueError(f'the page draws ballbots, not a {type(params).__name__}; take render_mode="rgb_array"')
     measures = {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")}
     return {
-        "robot": measures | {"wheel_radius": params.wheels.radius if params.wheels else 0.0},
+        "robot": measures | {"wheel_radius": params.wheel_radius},
         "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH, "goal": drawing.GOAL},
         "force_scale": drawing.FORCE_SCALE,
         "push_scale": drawing.PUSH_SCALE,
@@ -62,7 +68,7 @@ def moment(drawn: Drawing) -> dict[str, Any]:
     }
 
 
-def _robot(robot: Robot) -> dict[str, Any]:
+def _robot(robot: Drawn) -> dict[str, Any]:
     x = _numbers(robot.x)
     return {
         "x": x[:4],

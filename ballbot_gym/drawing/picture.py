@@ -6,12 +6,13 @@ painted twice as large and then halved, so that edges are smooth.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw
 
-from ballbot_gym.drawing import BALL, Drawing, GroundPath, Robot, arrows, pose
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.drawing import Drawing, Drawn, GroundPath, arrows, pose
+from ballbot_gym.robot import Robot, Sphere
 from ballbot_gym.tasks.marker import Marker
 
 YAW = math.radians(-55)
@@ -46,8 +47,6 @@ def _turned(*profile: tuple[float, float]) -> np.ndarray:
 
 _SPHERE = _turned(*((math.sin(a), 0.5 - 0.5 * math.cos(a)) for a in np.linspace(0, math.pi, 11)))
 _CYLINDER = _turned((0, 0), (1, 0), (1, 1), (0, 1))
-_BODY = _turned((0, 0), (1, 0), (1, 0.94))
-_CAP = _turned((1.02, 0.94), (1.02, 1), (0, 1))
 _CONE = _turned((0, 0), (1, 0), (0, 1))
 
 
@@ -75,7 +74,9 @@ class _Painter:
         self._drawing = drawing
         ahead = np.array([-math.sin(YAW) * math.cos(_PITCH), math.cos(YAW) * math.cos(_PITCH), -math.sin(_PITCH)])
         right = np.array([math.cos(YAW), math.sin(YAW), 0.0])
-        spread = max((math.dist(robot.x[:2], drawing.centre) for robot in drawing.robots), default=0.0)
+        spread = max(
+            (math.dist(drawing.params.position(robot.x), drawing.centre) for robot in drawing.robots), default=0.0
+        )
         self._eye = np.array([*drawing.centre, _AIM_HEIGHT]) - min(_DISTANCE + spread, _FARTHEST) * ahead
         self._axes = np.stack([right, np.cross(right, ahead), ahead])
         self._image = Image.new("RGB", (_FINE * width, _FINE * height), tuple(_FLOOR.tolist()))
@@ -93,7 +94,7 @@ class _Painter:
         bodies += [([_post(post)], post.color[3]) for post in posts if post.height >= _FLAT]
         self._paint_shadows(bodies)
         for robot, (solids, alpha) in zip(robots, bodies, strict=False):
-            if alpha == 1:
+            if alpha == 1 and (robot.u is not None or robot.push is not None):
                 solids += _arrows(self._drawing.params, robot)
         for solids, alpha in sorted(bodies, key=lambda body: -self._pixels(body[0][0][0].mean(axis=(0, 1)))[1]):
             self._paint_solids(solids, alpha)
@@ -172,14 +173,19 @@ def _post(marker: Marker) -> _Solid:
     return _placed(_CYLINDER, foot, foot + (0, 0, marker.height), marker.radius), marker.color
 
 
-def _robot(params: BallbotParams, robot: Robot) -> list[_Solid]:
-    place, up = pose(params, robot.x), np.array([0, 0, params.ball_radius])
-    ends, radius = (2 * place.body - place.top, place.top), params.body_radius
-    ball = _placed(_SPHERE, place.ball - up, place.ball + up, params.ball_radius)
-    return [(ball, BALL), (_placed(_BODY, *ends, radius), robot.color), (_placed(_CAP, *ends, radius), BALL)]
+def _robot(params: Robot, robot: Drawn) -> list[_Solid]:
+    solids = []
+    for shape in params.shapes(robot.x):
+        if isinstance(shape, Sphere):
+            centre, up = np.array(shape.centre), np.array([0, 0, shape.radius])
+            faces = _placed(_SPHERE, centre - up, centre + up, shape.radius)
+        else:
+            faces = _placed(_CYLINDER, np.array(shape.start), np.array(shape.end), shape.radius)
+        solids.append((faces, shape.color or robot.color))
+    return solids
 
 
-def _arrows(params: BallbotParams, robot: Robot) -> list[_Solid]:
+def _arrows(params: Any, robot: Drawn) -> list[_Solid]:
     """Those of a robot's force and push."""
     solids = []
     for color, (start, end) in arrows(pose(params, robot.x), robot):

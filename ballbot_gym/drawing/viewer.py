@@ -22,7 +22,7 @@ from typing import Any
 from ballbot_gym import lazy
 from ballbot_gym.drawing import Drawing
 from ballbot_gym.drawing.page import look, moment, page_html
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 
 PORT = 8080
 _NEXT_PORTS = 100  # that are tried where one is taken

@@ -11,7 +11,7 @@ from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoOmniSimulator, MujocoSimulator, import_mujoco
 from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.lazy import install
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Omni, PointBall, Robot, RollingBall
 
 __all__ = [
     "PHYSICS",
@@ -26,15 +26,14 @@ __all__ = [
     "make_simulator",
 ]
 
-PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator], Callable[..., Simulator]]] = {
-    "bullet": (BulletSimulator, BulletContactSimulator, BulletOmniSimulator),
-    "mujoco": (MujocoSimulator, MujocoContactSimulator, MujocoOmniSimulator),
-    "rk4": (Rk4Simulator, Rk4Simulator, Rk4Simulator),
+PHYSICS: dict[str, dict[type[Robot], Callable[..., Simulator]]] = {
+    "bullet": {PointBall: BulletSimulator, RollingBall: BulletContactSimulator, Omni: BulletOmniSimulator},
+    "mujoco": {PointBall: MujocoSimulator, RollingBall: MujocoContactSimulator, Omni: MujocoOmniSimulator},
+    "rk4": {Robot: Rk4Simulator},
 }
-"""Simulators by the name that `gymnasium.make(..., physics=name)` takes: of a ball that translates, of one that rolls, and of
-one that wheels drive.
+"""Simulators by the name that `gymnasium.make(..., physics=name)` takes, and by the kind of robot that they simulate.
 
-The first that is installed is the default.
+The first that is installed, and simulates the robot, is the default.
 """
 
 PHYSICS_NAMES = {"bullet": "PyBullet", "mujoco": "MuJoCo", "rk4": "the closed-form model"}
@@ -52,14 +51,16 @@ def installed_physics() -> list[str]:
     return [name for name in PHYSICS if find_spec(libraries[name]) is not None]
 
 
-def checked_physics(physics: Any) -> str:
+def checked_physics(physics: Any, params: Robot | None = None) -> str:
     """The name in `PHYSICS` of a physics that is given by it or by another of `PHYSICS_ALIASES`; None is the default.
+
+    With a robot the default is one that simulates it.
 
     Raises:
         ValueError: no physics of that name.
     """
     if physics is None:
-        return default_physics()
+        return default_physics(params)
     name = PHYSICS_ALIASES.get(physics, physics) if isinstance(physics, str) else physics
     if not isinstance(name, str) or name not in PHYSICS:
         raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
@@ -74,10 +75,14 @@ def check_installed(physics: str) -> None:
         import_mujoco()
 
 
-def default_physics() -> str:
-    """What `physics` is by default: the first that is installed. "rk4" comes with one warning per process."""
-    best = installed_physics()[0]
-    if best == "rk4" and not _noticed:
+def default_physics(params: Robot | None = None) -> str:
+    """What `physics` is by default: the first that is installed, and simulates the robot if one is given.
+
+    "rk4" comes with one warning per process where other physics could be installed.
+    """
+    able = [name for name in PHYSICS if params is None or _simulator_of(name, params)]
+    best = next(name for name in able if name in installed_physics())
+    if len(able) > 1 and best == "rk4" and not _noticed:
         _noticed.append(True)
         warnings.warn(
             f'Neither PyBullet nor MuJoCo is installed: physics="rk4" is used. For MuJoCo: {install("mujoco")}. '
@@ -87,9 +92,19 @@ def default_physics() -> str:
     return best
 
 
-def make_simulator(
-    physics: str, params: BallbotParams, control_dt: float, physics_dt: float | None = None
-) -> Simulator:
-    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`."""
-    kind = params.rolls if params.wheels is None else 2
-    return PHYSICS[physics][kind](params, control_dt, physics_dt)
+def make_simulator(physics: str, params: Robot, control_dt: float, physics_dt: float | None = None) -> Simulator:
+    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`.
+
+    Raises:
+        ValueError: this physics does not simulate this kind of robot.
+    """
+    simulator = _simulator_of(physics, params)
+    if simulator is None:
+        able = ", ".join(repr(name) for name in PHYSICS if _simulator_of(name, params))
+        raise ValueError(f"{PHYSICS_NAMES[physics]} does not simulate a {type(params).__name__}; give physics={able}")
+    return simulator(params, control_dt, physics_dt)
+
+
+def _simulator_of(physics: str, params: Robot) -> Callable[..., Simulator] | None:
+    """The simulator that was made for the nearest of a robot's classes."""
+    return next((PHYSICS[physics][kind] for kind in type(params).__mro__ if kind in PHYSICS[physics]), None)

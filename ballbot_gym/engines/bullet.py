@@ -6,11 +6,11 @@ import tempfile
 import threading
 import weakref
 from pathlib import Path
+from typing import Any
 
-from ballbot_gym import omni
 from ballbot_gym.engines.bullet_client import import_pybullet
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import omni, urdf_text
 
 _JOINTS = ("x", "y", "gamma", "theta", "psi")  # the last where wheels turn the body
 _loading = threading.Lock()
@@ -22,7 +22,7 @@ _PRESSED = -1e-5  # m: height of the ball at reset, about where its weight press
 class BulletSimulator(Simulator):
     """The URDF of a robot whose ball translates in PyBullet, in a physics client that this object owns."""
 
-    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+    def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
         """Loads the robot.
 
         Args:
@@ -50,9 +50,9 @@ class BulletSimulator(Simulator):
         for i, joint in enumerate(self._joints[:4]):
             self._bullet.resetJointState(self._robot, joint, x[i], x[i + 4], self._client)
 
-    def set_params(self, params: BallbotParams) -> None:
+    def set_params(self, params: Any) -> None:
         bullet, client, old = self._bullet, self._client, self._params
-        if (params.com_height, params.gravity, params.rolls) != (old.com_height, old.gravity, old.rolls):
+        if (params.com_height, params.gravity, type(params)) != (old.com_height, old.gravity, type(old)):
             self._reload(params)  # changeDynamics cannot move a link's centre of mass
             return
         self._params = params
@@ -75,17 +75,17 @@ class BulletSimulator(Simulator):
     def close(self) -> None:
         self._release()
 
-    def _reload(self, params: BallbotParams) -> None:
+    def _reload(self, params: Any) -> None:
         check_kind(params, self._params)
         self._bullet.removeBody(self._robot, physicsClientId=self._client)
         self._load(params)
 
-    def _load(self, params: BallbotParams) -> None:
+    def _load(self, params: Any) -> None:
         """Loads the robot without motors, damping or joint speed limits."""
         bullet, client, self._params = self._bullet, self._client, params
         with tempfile.TemporaryDirectory() as folder, _loading:
             path = Path(folder) / "ballbot.urdf"
-            path.write_text(params.to_urdf(), encoding="utf-8")
+            path.write_text(urdf_text(params), encoding="utf-8")
             # Bullet reads numbers by the process's locale: with decimal commas it would take "0.5" for 0 without a word.
             found = locale.setlocale(locale.LC_NUMERIC)
             locale.setlocale(locale.LC_NUMERIC, "C")
@@ -110,13 +110,24 @@ class BulletSimulator(Simulator):
         )
         self._check_held()
 
+    def _ball_link(self) -> tuple[int, tuple[float, ...]]:
+        """The link that is the ball, and the inertias that it must have, kg·m²; none where they have no effect."""
+        return self._joints[1], ()
+
     def _check_held(self) -> None:
         """Raises a RuntimeError if PyBullet holds other masses, inertias or a lower centre of mass than the robot has."""
-        robot = self._params
-        ball, body = self._index["roll"] if robot.rolls else self._joints[1], self._joints[-1]
+        robot, (link_of_ball, inertia) = self._params, self._ball_link()
         wanted = {
-            ball: (robot.ball_mass, *(robot.ball_inertia,) * 3 * robot.rolls),
-            body: (robot.body_mass, robot.inertia, robot.inertia, robot.axial_inertia, 0.0, 0.0, robot.com_height),
+            link_of_ball: (robot.ball_mass, *inertia),
+            self._joints[-1]: (
+                robot.body_mass,
+                robot.inertia,
+                robot.inertia,
+                robot.axial_inertia,
+                0.0,
+                0.0,
+                robot.com_height,
+            ),
         }
         for link, numbers in wanted.items():
             mass, _, inertia, place, *_ = self._bullet.getDynamicsInfo(self._robot, link, physicsClientId=self._client)
@@ -131,7 +142,7 @@ class BulletContactSimulator(BulletSimulator):
     The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
     """
 
-    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+    def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
         """Args: as for `BulletSimulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
         super().__init__(params, control_dt, physics_dt)
         bullet, client = self._bullet, self._client
@@ -151,7 +162,7 @@ class BulletContactSimulator(BulletSimulator):
         spin = (-x[5] / radius, x[4] / radius, 0.0)
         bullet.resetJointStateMultiDof(self._robot, self._ball, (0, 0, 0, 1), spin, physicsClientId=client)
 
-    def set_params(self, params: BallbotParams) -> None:
+    def set_params(self, params: Any) -> None:
         self._reload(params)  # in any case, so that nothing of the contact's settings is lost; see `_set_surface`
         self._set_ball()
 
@@ -183,6 +194,9 @@ class BulletContactSimulator(BulletSimulator):
         vx, vy = (s[1] for s in bullet.getJointStates(self._robot, self._joints[:2], physicsClientId=client))
         wx, wy, _ = bullet.getLinkState(self._robot, self._ball, computeLinkVelocity=1, physicsClientId=client)[7]
         return vx - wy * self._params.ball_radius, vy + wx * self._params.ball_radius
+
+    def _ball_link(self) -> tuple[int, tuple[float, ...]]:
+        return self._index["roll"], (self._params.ball_inertia,) * 3
 
     def _set_ball(self) -> None:
         bullet, client, robot = self._bullet, self._client, self._robot
@@ -217,7 +231,7 @@ class BulletOmniSimulator(BulletContactSimulator):
     would have if its ball did not slip. Both are held over a step of Bullet.
     """
 
-    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+    def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
         """Args: as for `BulletSimulator`."""
         super().__init__(params, control_dt, physics_dt)
         self._steps, self._substeps = self._substeps, 1
@@ -235,7 +249,6 @@ class BulletOmniSimulator(BulletContactSimulator):
 
     def step(self, u: tuple[float, ...]) -> State:
         bullet, client, robot, wheels = self._bullet, self._client, self._robot, self._params.wheels
-        assert wheels is not None
         x, turning = self._state()
         for _ in range(self._steps):
             tx, ty, tz = omni.torque_on_ball(self._params, x, turning, u)

@@ -1,20 +1,18 @@
 """The closed form as a simulator. It needs NumPy alone."""
 
-from ballbot_gym import dynamics, step_code
+from ballbot_gym import step_code
 from ballbot_gym.engines.simulator import Simulator, State, check_kind, whole_substeps
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot, substeps_for
 
 
 class Rk4Simulator(Simulator):
-    """The closed-form model, integrated by RK4 steps of at most `dynamics.RK4_STEP`."""
+    """The closed-form model, integrated by RK4 steps of at most `RK4_STEP`."""
 
-    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
-        """Args: as for `BulletSimulator`; physics_dt defaults to `dynamics.RK4_STEP`."""
+    def __init__(self, params: Robot, control_dt: float, physics_dt: float | None = None):
+        """Args: as for `BulletSimulator`; physics_dt defaults to `RK4_STEP`."""
         self._params = params
         self._dt = control_dt
-        self._substeps = (
-            dynamics.substeps_for(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
-        )
+        self._substeps = substeps_for(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
         self._each = range(self._substeps)  # made once: it is a hundredth of a step
         self._x: State = (0.0,) * params.state_size
         self._code: step_code.Work | None = None
@@ -22,11 +20,11 @@ class Rk4Simulator(Simulator):
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
         self._x = x
 
-    def set_params(self, params: BallbotParams) -> None:
+    def set_params(self, params: Robot) -> None:
         check_kind(params, self._params)
         self._params = params
         if self._code is not None:
-            self._code.given[-len(step_code.ROBOT) :] = [getattr(params, name) for name in step_code.ROBOT]
+            self._code.given[-len(params.kind.numbers) :] = params.numbers()
 
     def use_code(self) -> None:
         """Takes machine code if there is some."""
@@ -43,5 +41,5 @@ class Rk4Simulator(Simulator):
             if code.check[0] == 0:
                 self._x = code.unpack()
                 return self._x
-        self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps)
+        self._x = self._params.step(self._x, u, self._dt, self._substeps)
         return self._x

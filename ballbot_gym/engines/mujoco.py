@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import omni
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import omni
 
 _PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
 _ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo wants a mass of whatever moves
@@ -24,7 +23,7 @@ class MujocoSimulator(Simulator):
     _places = (0, 1, 2, 3)  # of x, y, γ and θ among the joints
     _longest = 0.005  # s, of a step by default
 
-    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+    def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
         """Makes the robot.
 
         Args:
@@ -58,7 +57,7 @@ class MujocoSimulator(Simulator):
         for i, place in enumerate(self._places):
             self._positions[place], self._velocities[place] = x[i], x[i + 4]
 
-    def set_params(self, params: BallbotParams) -> None:
+    def set_params(self, params: Any) -> None:
         check_kind(params, self._params)
         self._make(params)
 
@@ -74,7 +73,7 @@ class MujocoSimulator(Simulator):
         """
         return bool(self._warned[self._instabilities].any())
 
-    def _make(self, params: BallbotParams) -> None:
+    def _make(self, params: Any) -> None:
         self._params = params
         mujoco, spec = self._mujoco, self._mujoco.MjSpec()
         spec.option.timestep, spec.option.gravity = self._dt, (0, 0, -params.gravity)
@@ -243,7 +242,6 @@ class MujocoOmniSimulator(MujocoContactSimulator):
     def _brake(self) -> float:
         """Sets the floor's torque against the ball's spin about the vertical, and returns that spin, rad/s."""
         turn, wheels = np.empty(9), self._params.wheels
-        assert wheels is not None
         self._mujoco.mju_quat2Mat(turn, self._positions[6:])
         spin = float(turn[6:] @ self._velocities[6:])
         self._model.actuator_biasprm[3, 2] = omni.floor_torque(wheels, spin) / spin if spin else 0.0
@@ -256,7 +254,6 @@ class MujocoOmniSimulator(MujocoContactSimulator):
     def _rotor_torque(self) -> np.ndarray:
         """(3,) N·m, of the rotors on the ball, by the acceleration under all torques that are applied now."""
         mujoco, model, data, wheels = self._mujoco, self._model, self._data, self._params.wheels
-        assert wheels is not None
         mujoco.mj_forward(model, data)
         mujoco.mj_rnePostConstraint(model, data)
         spins, accelerations = data.cvel[:, :3], data.cacc[:, :3]
@@ -270,7 +267,6 @@ class MujocoOmniSimulator(MujocoContactSimulator):
     def _describe(self, spec: Any) -> None:
         super()._describe(spec)
         mujoco, robot, wheels = self._mujoco, self._params, self._params.wheels
-        assert wheels is not None
         body, ball = spec.body("body"), spec.body("ball")
         body.add_joint(name="psi", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
         for name, place in (("body", body), ("ball", ball), ("floor", spec.worldbody)):

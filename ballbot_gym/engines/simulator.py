@@ -4,10 +4,10 @@ import math
 from typing import Protocol
 
 from ballbot_gym.ops import is_number
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 
 State = tuple[float, ...]
-"""(8,) state as a tuple of floats, or (11,) with wheels; order and units in `dynamics.STATE` and `OMNI_STATE`."""
+"""(8,) state as a tuple of floats, or (11,) with wheels; order and units in `Ballbot.STATE` and `OMNI_STATE`."""
 
 MOST_FRICTION = 1e3
 """What engines of contact take for unlimited friction."""
@@ -15,12 +15,12 @@ _MOST_SUBSTEPS = 10_000
 
 
 class Simulator(Protocol):
-    """One ballbot whose force is held over control steps."""
+    """One robot whose action is held over control steps."""
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
         """Puts the robot into state x, and whatever else an engine remembers into what `memory` gave."""
 
-    def set_params(self, params: BallbotParams) -> None:
+    def set_params(self, params: Robot) -> None:
         """Replaces the robot by one of the same kind; call `reset` after it."""
 
     def step(self, u: tuple[float, ...]) -> State:
@@ -51,11 +51,13 @@ class Simulator(Protocol):
         """Releases what the simulator holds; may be called again."""
 
 
-def check_kind(params: BallbotParams, own: BallbotParams) -> None:
+def check_kind(params: Robot, own: Robot) -> None:
     """Raises a ValueError if a robot is of another kind than a simulator's own."""
-    if (params.rolls, params.wheels is None) != (own.rolls, own.wheels is None):
-        kind = f"rolls={own.rolls}" + (" and wheels" if own.wheels else "")
-        raise ValueError(f"this simulator is of a ball with {kind}; make another with make_simulator()")
+    if type(params) is not type(own):
+        raise ValueError(
+            f"this simulator is of a {type(own).__name__}, not of a {type(params).__name__}; make another with "
+            "make_simulator()"
+        )
 
 
 def whole_substeps(control_dt: float, physics_dt: float) -> int:

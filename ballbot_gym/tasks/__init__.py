@@ -1,5 +1,6 @@
 """The tasks, one file each."""
 
+from ballbot_gym.tasks.ballbot import BallbotTask
 from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -12,4 +13,4 @@ TASKS: dict[str, type[Task]] = {}
 SHIPPED: tuple[type[Task], ...] = (Stabilize, Turn, Orbit, Weave)
 """The tasks that come with the package."""
 
-__all__ = ["SHIPPED", "TASKS", "Reference", "Task"]
+__all__ = ["SHIPPED", "TASKS", "BallbotTask", "Reference", "Task"]

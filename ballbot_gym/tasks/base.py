@@ -2,14 +2,13 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ballbot_gym import dynamics, ops
-from ballbot_gym.ops import Vector, is_number, is_positive, squared
-from ballbot_gym.params import BallbotParams
+from ballbot_gym import ops
+from ballbot_gym.ops import Vector, is_number, is_positive
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.symmetry import Mirror
 
@@ -40,11 +39,11 @@ class Task(ABC):
     arriving. For every episode, however it ends, return + cost = `survival_pay`. So the greatest return is the least cost,
     whatever survival_reward is.
 
-    x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). With wheels x is (..., 11) and u is
-    (..., 3); a task reads the first eight components, `ops.components(x)[:8]`. Cost, margins, goal and observation
-    are written with `ops`, so that NumPy, CasADi and torch evaluate the same lines; they are smooth in x and u.
+    x is a state (..., n) and u what the actuators apply (..., m), as `STATE` and `ACTION` of the robot name them; c are the
+    episode's constants (..., nc). Cost, margins, goal and observation are written with `ops`, so that NumPy, CasADi and torch
+    evaluate the same lines; they are smooth in x and u.
 
-    Where `clock` is True, cost, goal, margins, arena and observation also depend on the episode's time: they find it, s, as
+    Where `clock` is True, cost, goal, margins and observation also depend on the episode's time: they find it, s, as
     the last entry of c, after the constants of `constant_names`, and `at` puts it there. All other methods get c without it.
     A step's cost is taken when the step begins, its goal and limits when it ends.
 
@@ -55,26 +54,25 @@ class Task(ABC):
     """Longest episode, s."""
     control_dt: float = 0.02
     """How long each force is held, s."""
-    max_tilt: float = math.radians(80)
-    """Tilt beyond which the robot has fallen, rad."""
     survival_reward: float = 100.0
     """Paid for every second lived, 1/s: more than nearly every motion in the arena costs."""
 
-    heading_weight: float = field(default=0.0, repr=False)
-    """Of 2 (1 − cos ψ), which is ψ² near 0, of robots with wheels, which yaw, 1/s."""
-
     id: ClassVar[str]
     """Gymnasium id."""
+    ROBOT: ClassVar[str] = "paper"
+    """Name of the robot that does the task where none is named."""
     observation_scale: ClassVar[tuple[float, ...]]
     """What each observed quantity is divided by, in its unit."""
     constant_names: ClassVar[tuple[str, ...]] = ()
     """Names of the episode's constants c, in order."""
-    margin_names: ClassVar[tuple[str, ...]] = ("tilt",)
+    margin_names: ClassVar[tuple[str, ...]] = ()
     """What each of `margins` keeps."""
     reward_threshold: ClassVar[float | None] = None
     """Mean return on the certified episodes, with default fields, at a mean regret of 10 %."""
-    NOT_THE_PROBLEM: ClassVar[frozenset[str]] = frozenset({"survival_reward", "arena_radius", "arena_factor"})
+    NOT_THE_PROBLEM: ClassVar[frozenset[str]] = frozenset({"survival_reward"})
     """Fields that move no optimum: they shape rewards, or bound where no optimum goes."""
+    MAY_BE_ZERO: ClassVar[frozenset[str]] = frozenset()
+    """Fields that may be 0. While they are, `problem` leaves them out, as before they were there."""
     mirrors: ClassVar[tuple[Mirror, ...]] = ()
     """Its mirror images; with no change they form a group."""
     frame: ClassVar[str | None] = None
@@ -90,7 +88,7 @@ class Task(ABC):
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
     clock: ClassVar[bool] = False
-    """Whether cost, goal, margins, arena and observation depend on the episode's time."""
+    """Whether cost, goal, margins and observation depend on the episode's time."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -99,7 +97,7 @@ class Task(ABC):
             value = getattr(self, each.name)
             if not is_number(value):
                 raise ValueError(f"{type(self).__name__}: {each.name} must be a number, not {value!r}")
-            if not is_positive(value) and not (each.name == "heading_weight" and value == 0):
+            if not is_positive(value) and not (each.name in self.MAY_BE_ZERO and value == 0):
                 raise ValueError(f"{type(self).__name__}: {each.name} must be positive and finite, not {value}")
             object.__setattr__(self, each.name, float(value))  # so that 8 and 8.0 are the same task
         if not 0.5 <= self.duration / self.control_dt <= MAX_STEPS:
@@ -110,8 +108,6 @@ class Task(ABC):
             raise ValueError(
                 f"duration {self.duration} s is not a whole number of control steps of {self.control_dt} s"
             )
-        if self.max_tilt >= math.pi / 2:
-            raise ValueError(f"max_tilt must be below 90°, not {math.degrees(self.max_tilt):.1f}°")
 
     @property
     def steps(self) -> int:
@@ -126,12 +122,12 @@ class Task(ABC):
     @property
     def limit_names(self) -> tuple[str, ...]:
         """What each of `limits` keeps."""
-        return (*self.margin_names, "arena")
+        return self.margin_names
 
     def problem(self) -> str:
         """The task's name and the fields that define its optima: tells whether an optimum or a policy belongs to a task."""
         named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
-        named = (name for name in named if name != "heading_weight" or self.heading_weight)  # as before there was one
+        named = (name for name in named if name not in self.MAY_BE_ZERO or getattr(self, name))
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
 
     def at(self, c: Vector, time: Any) -> Vector:
@@ -141,22 +137,30 @@ class Task(ABC):
         """
         return ops.stack((*ops.components(c), time), like=c) if self.clock else c
 
-    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_constants(self, z: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
         """The constants (nc) that `constant_draws` uniform numbers z in [0, 1) stand for; z may hold batches."""
         return ()
 
     @abstractmethod
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
         """The initial state (8) that `state_draws` uniform numbers z stand for, in an episode with constants c."""
 
-    def start(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
-        """As `draw_state`, with all components that the robot has: with wheels it neither turns nor spins at the start."""
-        x = self.draw_state(z, c, params)
-        if len(x) not in (8, params.state_size):
-            raise ValueError(f"{type(self).__name__}.draw_state gives {len(x)} numbers; give the 8 of dynamics.STATE")
-        return (*x, *(0.0 * x[0],) * (params.state_size - len(x)))
+    def start(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
+        """As `draw_state`, with all components that the robot has.
 
-    def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+        Raises:
+            ValueError: `draw_state` gives another number of components.
+        """
+        x = self.draw_state(z, c, params)
+        if len(x) != params.state_size:
+            names = ", ".join(each.name for each in params.STATE)
+            raise ValueError(
+                f"{type(self).__name__}.draw_state gives {len(x)} numbers; give the {params.state_size} of the robot's "
+                f"state: {names}"
+            )
+        return x
+
+    def sample(self, rng: np.random.Generator, params: Any) -> tuple[np.ndarray, np.ndarray]:
         """Draws an episode: initial state (8,) and constants (nc,)."""
         c = self.draw_constants(tuple(rng.random(self.constant_draws).tolist()), params)
         x = self.start(tuple(rng.random(self.state_draws).tolist()), c, params)
@@ -166,7 +170,7 @@ class Task(ABC):
         """About how far a state is from the goal, m, for learners that shape rewards; None where a task defines none."""
         return None
 
-    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+    def measures(self, x: np.ndarray, c: np.ndarray, params: Any) -> dict[str, float]:
         """What makes an episode easy or hard, by name and unit, of its initial state (8,) and constants (nc,).
 
         Evaluation bins its results by each of these. The default is the constants; a task overrides it where derived
@@ -174,7 +178,7 @@ class Task(ABC):
         """
         return dict(zip(self.constant_names, map(float, c), strict=True))
 
-    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+    def check_constants(self, c: np.ndarray, params: Any) -> None:
         """Raises a ValueError that names the constant that makes no sense."""
 
     @abstractmethod
@@ -185,16 +189,23 @@ class Task(ABC):
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         """Success iff every entry ≤ 0: at the first such state if `first_exit`, else at the end of the episode."""
 
-    @abstractmethod
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
-        """The steady motion that linear control steers to from state x."""
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Any) -> Reference:
+        """The steady motion that linear control steers to from state x; default, the robot's rest."""
+        return Reference(params.rest()[None], np.zeros((1, params.action_size)))
 
-    @abstractmethod
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
-        """Ground paths from state x from which optimizers start, one per basin worth trying, the likeliest first.
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[np.ndarray]:
+        """Paths (n+1, 2), m, of a ballbot's ball along which optimizers start; tasks of other robots have `guesses` alone."""
+        return []
 
-        Each is (n+1, 2), m, one ball position per control step: n = `steps`, or less for first-exit tasks.
+    def guesses(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+        """States (n+1, n_x) and actions (n, n_u) from state x from which optimizers start, the likeliest first.
+
+        They need not be motions of the robot; n = `steps`, or less for first-exit tasks. The default goes straight to the
+        end of the reference, and stays there.
         """
+        target = self.reference(x, c, params)
+        share = np.minimum(np.linspace(0, 2, self.steps + 1), 1.0)[:, None]
+        return [((1 - share) * x + share * target.x[-1], np.repeat(target.u[-1:], self.steps, axis=0))]
 
     def passed_obstacles(self, c: np.ndarray) -> np.ndarray | None:
         """Obstacles passed along x, where `guess_paths` has one path for every choice of sides; None for other tasks.
@@ -222,40 +233,26 @@ class Task(ABC):
     def observe(self, x: Vector, c: Vector) -> Vector:
         """Observation (..., no), each quantity divided by its `observation_scale`; no running statistics."""
 
-    def seen(self, x: Vector, c: Vector) -> Vector:
-        """`observe`, and of a robot with wheels also cos ψ, sin ψ, ψ̇ and ω_z, these two divided by 5 rad/s."""
+    def seen(self, x: Vector, c: Vector, params: Any) -> Vector:
+        """`observe`, followed by the robot's `outputs`, each divided by its `OUTPUT_SCALE`."""
         observed = self.observe(x, c)
-        more = ops.components(x)[8:]
-        if not more:
+        outputs = params.outputs(x)
+        if not outputs:
             return observed
-        psi, psi_dot, spin = more
-        return ops.stack((*ops.components(observed), ops.cos(psi), ops.sin(psi), psi_dot / 5.0, spin / 5.0), like=x)
+        more = (output / scale for output, scale in zip(outputs, params.OUTPUT_SCALE, strict=True))
+        return ops.stack((*ops.components(observed), *more), like=x)
 
-    def observation_size(self, params: BallbotParams) -> int:
+    def observation_size(self, params: Any) -> int:
         """Numbers that a robot observes."""
-        return len(self.observation_scale) + (0 if params.wheels is None else 4)
-
-    def heading_cost(self, x: Vector) -> Any:
-        """Part of the cost rate, 1/s, by which tasks hold the heading of a robot that yaws."""
-        yaw = ops.components(x)[8:9] if self.heading_weight else ()
-        return self.heading_weight * 2 * (1 - ops.cos(yaw[0])) if yaw else 0.0
+        return len(self.observation_scale) + len(params.OUTPUTS)
 
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """What optimizers keep ≥ 0. Every task has the tilt limit; obstacles add theirs."""
-        return (dynamics.cos_tilt(x) - math.cos(self.max_tilt),)
-
-    def arena(self, c: Vector) -> tuple[Any, Any, Any]:
-        """Centre x, y and radius of the circle that the ball must not leave, m. A task overrides it with a closer one."""
-        return 0.0, 0.0, 100.0
+        """What optimizers keep ≥ 0, as `margin_names` names it."""
+        return ()
 
     def limits(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """Safe iff every entry ≥ 0: the margins, then the arena's, about the distance to its edge, m.
-
-        The arena is no margin, because it is far from every optimum: optimizers need not know it.
-        """
-        px, py, *_ = ops.components(x)
-        x_centre, y_centre, radius = self.arena(c)
-        return (*self.margins(x, c), (radius * radius - squared(px - x_centre, py - y_centre)) / (2 * radius))
+        """Safe iff every entry ≥ 0, as `limit_names` names it: the margins, and what optimizers need not know."""
+        return self.margins(x, c)
 
     def violated(self, x: Vector, c: Vector) -> str:
         """The name of the first limit that one state violates, or "". A state that is not finite violates one."""

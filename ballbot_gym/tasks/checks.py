@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks.base import Task
 
 
-def check_methods(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, where: str = "") -> None:
+def check_methods(task: Task, params: Robot, x: np.ndarray, c: np.ndarray, where: str = "") -> None:
     """Raises a ValueError that names the method of a task that gives what nothing can use.
 
     Args:
@@ -40,7 +40,7 @@ def check_methods(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarra
         )
 
 
-def check_paths(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, where: str) -> None:
+def check_paths(task: Task, params: Robot, x: np.ndarray, c: np.ndarray, where: str) -> None:
     """Raises a ValueError where a task guesses no path from a state x (8,), or none that an optimizer can take."""
     paths, kind = task.guess_paths(x, c, params), type(task).__name__
     if not isinstance(paths, list | tuple | np.ndarray) or not len(paths):
@@ -52,7 +52,7 @@ def check_paths(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray,
             )
 
 
-def _check_cost(task: Task, params: BallbotParams, x: np.ndarray, begin: np.ndarray, where: str) -> None:
+def _check_cost(task: Task, params: Robot, x: np.ndarray, begin: np.ndarray, where: str) -> None:
     kind, force = type(task).__name__, np.full(params.action_size, 0.1 * params.force_limit)
     given = [task.cost(x, u, begin) for u in (0 * force, force, force)]
     numbers = [_number(cost) for cost in given]

@@ -8,8 +8,9 @@ import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import Reference, Task
+from ballbot_gym.robot import Ballbot
+from ballbot_gym.tasks.ballbot import BallbotTask
+from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.symmetry import HALF_TURN, MIRROR_X, MIRROR_Y
 
@@ -17,7 +18,7 @@ _GUESS_SECONDS = 1.5  # how long a guessed path takes to reach its speed
 
 
 @dataclass(frozen=True)
-class Orbit(Task):
+class Orbit(BallbotTask):
     """Ride a circle about the origin at a commanded speed, leaning 10° to 45° inwards (the paper's Fig. 5a).
 
     Observation, float32 (13,):
@@ -107,12 +108,12 @@ class Orbit(Task):
                 f"Orbit: arena_factor must exceed 1, so that the circle lies inside, not {self.arena_factor}"
             )
 
-    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_constants(self, z: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         radius = between(z[0], self.min_radius, self.max_radius)
-        speed = orbit_speed(params, radius, between(z[1], self.min_steady_tilt, self.max_steady_tilt))
+        speed = params.steady_speed(radius, between(z[1], self.min_steady_tilt, self.max_steady_tilt))
         return radius, ops.where(z[2] < 0.5, -1.0, 1.0) * speed
 
-    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+    def measures(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> dict[str, float]:
         radius, speed = map(float, c)
         return {
             "radius, m": radius,
@@ -121,14 +122,14 @@ class Orbit(Task):
             "direction, 1 is counter-clockwise": math.copysign(1.0, speed),
         }
 
-    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+    def check_constants(self, c: np.ndarray, params: Ballbot) -> None:
         smallest = params.pivot_inertia / params.first_moment
         if c[0] <= smallest:
             raise ValueError(f"{self.id}: radius must exceed {smallest:.3f} m, not {c[0]:g}")
         if c[1] == 0:
             raise ValueError(f"{self.id}: speed must not be 0")
 
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         radius, _ = c
         bearing, zero = 2 * math.pi * z[0], 0.0 * radius
         return (radius * ops.cos(bearing), radius * ops.sin(bearing), zero, zero, zero, zero, zero, zero)
@@ -153,7 +154,7 @@ class Orbit(Task):
         _, speed = ops.components(c)
         return (squared(radius_error) / 0.2**2 - 1, squared(vx_error, vy_error) / (0.2 * speed) ** 2 - 1)
 
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
         """One round of the steady orbit, counted from the bearing of x."""
         rate = c[1] / c[0]
         steps = max(8, round(2 * math.pi / abs(rate) / self.control_dt))
@@ -162,7 +163,7 @@ class Orbit(Task):
         states, forces = steady_orbit(params, c[0], c[1], bearings)
         return Reference(states, forces, closed=True)
 
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> list[np.ndarray]:
         """Along the circle, gathering speed."""
         t = self.control_dt * np.arange(self.steps + 1)
         progress = np.where(t < _GUESS_SECONDS, t**2 / (2 * _GUESS_SECONDS), t - _GUESS_SECONDS / 2)  # s
@@ -184,37 +185,18 @@ class Orbit(Task):
         return (squared(px, py) - radius * radius) / (2 * radius), vx + rate * py, vy - rate * px
 
 
-def orbit_speed(params: BallbotParams, radius: Any, tilt: Any) -> Any:
-    """Speed, m/s, at which a steady orbit of this radius, m, leans inwards by this tilt, rad.
-
-    With J = I + ml², h = ml and Ω = v/R: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² R. The body's axial inertia, 1.1 % of J
-    here, is left out: with it the orbit is steady to 2 % of the ball's and 4.5 % of the leans' accelerations at 45°. A ball
-    that rolls is driven by a torque, which tilts the body too: Ω² = hg sin(tilt) / (cos(tilt) (hR − J sin(tilt)) +
-    r (m R − h sin(tilt))) with the ball's radius r and the moving mass m.
-    """
-    h, inertia = params.first_moment, params.pivot_inertia
-    sin_tilt, cos_tilt = ops.sin(tilt), ops.cos(tilt)
-    if params.rolls:
-        torque = params.ball_radius * (params.moving_mass * radius - h * sin_tilt)
-        resistance = cos_tilt * (h * radius - inertia * sin_tilt) + torque
-        return radius * ops.sqrt(h * params.gravity * sin_tilt / resistance)
-    return radius * ops.sqrt(h * params.gravity * sin_tilt / cos_tilt / (h * radius - inertia * sin_tilt))
-
-
-def orbit_tilt(params: BallbotParams, radius: float, speed: float) -> float:
-    """Steady inward tilt, rad: the inverse of `orbit_speed`, by bisection (it grows with speed)."""
+def orbit_tilt(params: Ballbot, radius: float, speed: float) -> float:
+    """Steady inward tilt, rad: the inverse of `Ballbot.steady_speed`, by bisection (it grows with speed)."""
     low, high = 0.0, math.atan(1e3)
     for _ in range(60):
         middle = 0.5 * (low + high)
         h, inertia = params.first_moment, params.pivot_inertia
         too_fast = inertia * math.sin(middle) >= h * radius  # sufficient where the ball rolls
-        low, high = (low, middle) if too_fast or orbit_speed(params, radius, middle) > abs(speed) else (middle, high)
+        low, high = (low, middle) if too_fast or params.steady_speed(radius, middle) > abs(speed) else (middle, high)
     return 0.5 * (low + high)
 
 
-def steady_orbit(
-    params: BallbotParams, radius: float, speed: float, bearings: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def steady_orbit(params: Ballbot, radius: float, speed: float, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States (n, 8) and forces (n, 2) of the steady orbit at ball bearings (n,), rad."""
     tilt, rate = orbit_tilt(params, radius, speed), speed / radius
     outward = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)

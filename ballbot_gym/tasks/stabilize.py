@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import dynamics, ops
+from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, then_stay
-from ballbot_gym.tasks.base import Reference, Task
+from ballbot_gym.robot import Ballbot, cos_tilt, tilt
+from ballbot_gym.tasks.ballbot import BallbotTask
+from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.symmetry import HALF_TURN, MIRROR_X, MIRROR_Y
 
@@ -18,7 +19,7 @@ _GUESS_SECONDS = 2.5  # how long a guessed path takes to come to rest
 
 
 @dataclass(frozen=True)
-class Stabilize(Task):
+class Stabilize(BallbotTask):
     """Come to rest at the origin (the paper's Figs 2 and 3, from random states).
 
     Observation, float32 (8,):
@@ -76,11 +77,11 @@ class Stabilize(Task):
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
     reward_threshold = 771.5
 
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         limits = (self.start_position, self.start_lean, self.start_speed, self.start_lean_rate)
         return tuple(between(z[i], -limits[i // 2], limits[i // 2]) for i in range(8))
 
-    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+    def measures(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> dict[str, float]:
         """Distance, speeds and leans of the start."""
         px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = map(float, x[:8])
         # across the ground, of the length sin(tilt): the direction in which the body leans
@@ -89,7 +90,7 @@ class Stabilize(Task):
         return {
             "distance, m": math.hypot(px, py),
             "speed, m/s": math.hypot(vx, vy),
-            "tilt, degrees": math.degrees(dynamics.tilt(x)),
+            "tilt, degrees": math.degrees(tilt(x)),
             "speed along the lean, m/s": (vx * lean_x + vy * lean_y) / length if length else 0.0,
             "tilt rate, rad/s": (lean_x * gamma_dot + lean_y * math.cos(gamma) * theta_dot) / length if length else 0.0,
         }
@@ -109,10 +110,10 @@ class Stabilize(Task):
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         return at_rest(x)
 
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
         return Reference(np.zeros((1, 8)), np.zeros((1, 2)))
 
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> list[np.ndarray]:
         rest = np.zeros(2)
         path = cubic(x[:2], x[4:6], rest, rest, round(_GUESS_SECONDS / self.control_dt), self.control_dt)
         return [then_stay(path, self.steps)]
@@ -130,6 +131,6 @@ def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
     return (
         squared(px - x_goal, py - y_goal) / 0.1**2 - 1,
         squared(vx, vy) / 0.1**2 - 1,
-        (1 - dynamics.cos_tilt(x)) / (1 - math.cos(math.radians(2))) - 1,
+        (1 - cos_tilt(x)) / (1 - math.cos(math.radians(2))) - 1,
         squared(gamma_dot, theta_dot) / 0.1**2 - 1,
     )

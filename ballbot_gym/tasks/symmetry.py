@@ -137,7 +137,7 @@ def _steady_orbit(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any
 def _steady_lean(pull: Any, radius: Any, substitutions: int = 3) -> Any:
     """Sine of the lean on a circle of this radius, m, where the ball is pulled inwards by `pull` times 10 m/s².
 
-    See `orbit.orbit_speed`, whose equation substitutions solve, three of them to 0.003, with J/h of the paper's robot.
+    See `PointBall.steady_speed`, whose equation substitutions solve, three of them to 0.003, with J/h of the paper's robot.
     """
     slope = pull
     for _ in range(substitutions):

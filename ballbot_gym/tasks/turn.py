@@ -6,11 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ballbot_gym import dynamics, ops
+from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic
-from ballbot_gym.tasks.base import Reference, Task
+from ballbot_gym.robot import Ballbot, cos_tilt
+from ballbot_gym.tasks.ballbot import BallbotTask
+from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
 
 _START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
@@ -20,7 +21,7 @@ _SHAPING_SECONDS = 0.3  # s: how much a velocity error counts in the distance to
 
 
 @dataclass(frozen=True)
-class Turn(Task):
+class Turn(BallbotTask):
     """Turn by 90°: from (0, −1) moving (0, v) through the gate at (1, 0) moving (v, 0), as in the paper's Fig. 4.
 
     Observation, float32 (9,):
@@ -98,17 +99,17 @@ class Turn(Task):
                 f"and at most {self.MAX_SPEED:g} m/s"
             )
 
-    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_constants(self, z: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         return (between(z[0], self.min_speed, self.max_speed),)
 
-    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+    def measures(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> dict[str, float]:
         return {"speed, m/s": float(c[0])}
 
-    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+    def check_constants(self, c: np.ndarray, params: Ballbot) -> None:
         if not 0 < c[0] <= self.MAX_SPEED:
             raise ValueError(f"{self.id}: speed must be in (0, {self.MAX_SPEED:g}] m/s, not {c[0]:g}")
 
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         (speed,) = c
         zero = 0.0 * speed  # of the shape of a batch, if c is one
         return (zero + _START[0], zero + _START[1], zero, zero, zero, speed, zero, zero)
@@ -131,7 +132,7 @@ class Turn(Task):
         return (
             squared(px - _GATE[0], py - _GATE[1]) / 0.2**2 - 1,
             squared(vx - speed, vy) / 0.5**2 - 1,
-            (1 - dynamics.cos_tilt(x)) / (1 - math.cos(math.radians(10))) - 1,
+            (1 - cos_tilt(x)) / (1 - math.cos(math.radians(10))) - 1,
             squared(gamma_dot, theta_dot) - 1,
         )
 
@@ -142,7 +143,7 @@ class Turn(Task):
         off = _SHAPING_SECONDS * (vx - speed), _SHAPING_SECONDS * vy
         return ops.sqrt(squared(px - _GATE[0], py - _GATE[1], *off, gamma, theta))
 
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
         """The straight motion at (v, 0) that passes the gate after a time proportional to v."""
         steps = min(max(1, round(_LINEAR_SECONDS_PER_SPEED * c[0] / self.control_dt)), self.steps)
         to_go = self.control_dt * np.arange(-steps, 1)
@@ -152,7 +153,7 @@ class Turn(Task):
         states[:, 4] = c[0]
         return Reference(states, np.zeros((steps + 1, 2)))
 
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> list[np.ndarray]:
         """Cubics to the gate, which at speed bulge into the direct turn, and into the loop of 270° on its left."""
         gate_velocity = np.array([c[0], 0.0])
         paths = []

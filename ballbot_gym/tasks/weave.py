@@ -8,9 +8,10 @@ import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import catmull_rom, then_stay
-from ballbot_gym.tasks.base import Reference, Task
+from ballbot_gym.robot import Ballbot
+from ballbot_gym.tasks.ballbot import BallbotTask
+from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import at_rest
 from ballbot_gym.tasks.symmetry import MIRROR_Y
@@ -22,7 +23,7 @@ _GUESS_SECONDS = 3.5  # how long a guessed path takes to the goal
 
 
 @dataclass(frozen=True)
-class Weave(Task):
+class Weave(BallbotTask):
     """Weave through 2 to 5 round obstacles and come to rest behind them (the paper's Fig. 5b).
 
     Observation, float32 (23,):
@@ -93,7 +94,7 @@ class Weave(Task):
     state_draws = 1
     reward_threshold = 708.4
 
-    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_constants(self, z: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         which, length, first_side, *shared = z
         stretch, offset, size = (shared[i : i + MAX_OBSTACLES] for i in (0, MAX_OBSTACLES, 2 * MAX_OBSTACLES))
         count = 2 + 0.0 * which + (which >= 0.25) + (which >= 0.5) + (which >= 0.75)  # of the dtype of a batch
@@ -114,7 +115,7 @@ class Weave(Task):
             obstacles.append(tuple(ops.where(i < count, new, old) for new, old in zip(drawn, last, strict=True)))
         return (distance, 0.0 * distance, *(value for obstacle in obstacles for value in obstacle))
 
-    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+    def measures(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> dict[str, float]:
         goal, obstacles = split_constants(c)
         free = [
             float(np.hypot(*(b - a)[:2]) - a[2] - b[2] - 2 * self.ball_radius) for a, b in itertools.pairwise(obstacles)
@@ -127,7 +128,7 @@ class Weave(Task):
             "start y, m": float(x[1]),
         }
 
-    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+    def check_constants(self, c: np.ndarray, params: Ballbot) -> None:
         goal, obstacles = split_constants(c)
         for i, (x, y, radius) in enumerate(obstacles):
             if radius <= 0:
@@ -135,7 +136,7 @@ class Weave(Task):
             if np.hypot(x - goal[0], y - goal[1]) <= radius + self.ball_radius:
                 raise ValueError(f"{self.id}: the goal lies in obstacle {i}")
 
-    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Ballbot) -> tuple[Any, ...]:
         zero = 0.0 * z[0]
         return (zero, between(z[0], -0.3, 0.3), zero, zero, zero, zero, zero, zero)
 
@@ -171,13 +172,13 @@ class Weave(Task):
         x_goal, y_goal, *_ = ops.components(c)
         return at_rest(x, x_goal, y_goal)
 
-    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+    def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
         """At rest at the goal: linear control knows nothing of obstacles."""
         rest = np.zeros((1, 8))
         rest[0, :2] = c[:2]
         return Reference(rest, np.zeros((1, 2)))
 
-    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> list[np.ndarray]:
         """A path for every choice of sides, the shortest first: the best choice is mostly among the first three."""
         _, obstacles = split_constants(c)
         paths = [self.routed_path(x, c, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))]

@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ballbot_gym.lazy import called, exports, need
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 need(__name__, "casadi", "scipy")
 
-CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
+CONTROLLERS: dict[str, Callable[[Task, Robot], Controller]] = {
     "lqr": called("ballbot_baselines.feedback.lqr:LqrController"),
     "trajopt": called("ballbot_baselines.feedback.trajopt:TrajoptController"),
     "nmpc": called("ballbot_baselines.feedback.nmpc:NmpcController"),
@@ -35,7 +35,7 @@ CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 """Every controller by its name on the command line. To add a controller, write one file and add one line here."""
 
 _ADAPTIVE = called("ballbot_baselines.feedback.adaptive:AdaptiveNmpcController")
-VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
+VARIANTS: dict[str, Callable[[Task, Robot], Controller]] = {
     "nmpc-offset-free": called("ballbot_baselines.feedback.nmpc:offset_free_nmpc"),
     "cautious": called("ballbot_baselines.feedback.trajopt:cautious_trajopt"),
     "nmpc-adaptive": partial(_ADAPTIVE, ending="-adaptive"),

@@ -139,7 +139,7 @@ def _registered(options: list[str]) -> list[str]:
     and "pybullet".
     """
     from ballbot_gym.engines import PHYSICS_ALIASES
-    from ballbot_gym.robots import register_robot, short_name
+    from ballbot_gym.robot import register_robot, short_name
 
     named = []
     for option in options:

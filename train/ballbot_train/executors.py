@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from ballbot_gym import registry
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robots import Robot
+from ballbot_gym.robot import Registered
 
 _NODE_SECONDS = 5.0  # between two looks whether a cluster has more cores
 _RETRIES = 5  # of a task on a cluster whose worker or node dies
@@ -126,7 +126,7 @@ def _result_of(future: Future) -> Any:
 
 
 def _attempt(
-    function: Callable[..., Any], arguments: tuple[Any, ...], modules: tuple[str, ...], robots: dict[str, Robot]
+    function: Callable[..., Any], arguments: tuple[Any, ...], modules: tuple[str, ...], robots: dict[str, Registered]
 ) -> tuple[Any, Exception | None, str]:
     """On a worker, what a task returned; or what it raised, and where. An error that cannot be pickled becomes a
     RuntimeError. Tasks know what users registered where the run began, `modules` and `robots`.
@@ -234,7 +234,7 @@ def _code(folder: Path) -> list[Any]:
     The package that reads URDFs is copied with them, as a wheel holds it.
     """
     import ballbot_gym
-    from ballbot_gym.params import URDF_FOLDER
+    from ballbot_gym.robot import URDF_FOLDER
 
     ours, copied = ("ballbot_baselines", "ballbot_train"), folder / "ballbot_gym"
     shutil.copytree(Path(ballbot_gym.__file__).parent, copied, ignore=shutil.ignore_patterns("__pycache__"))

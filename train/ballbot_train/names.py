@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.identity import digest
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS
 
 _PLAIN = re.compile("[a-z0-9]+(-[a-z0-9]+)*")
 _DIGEST = 12  # hexadecimal digits

@@ -17,7 +17,7 @@ import numpy as np
 import ballbot_gym
 from ballbot_gym import files
 from ballbot_gym.lazy import imports_of, need
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicyNetwork, load_network
 from ballbot_train.policy_files import OBSERVATION_VERSION, PolicyError, read_description, weights_digest
@@ -75,12 +75,12 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
         "task": task.id,
         "problem": task.problem(),
         "robot": robot,
-        "observation": observation_table(task) + _HEADING * (params.wheels is not None),
+        "observation": observation_table(task) + _HEADING * bool(params.OUTPUTS),
         "observation_scale": json.dumps(task.observation_scale),
         "history": str(described.get("spec", {}).get("history", 0)),
         "observation_version": str(OBSERVATION_VERSION),
         "constants": json.dumps(task.constant_names),
-        "action": _TORQUES if params.wheels is not None else _FORCES,
+        "action": _TORQUES if params.OUTPUTS else _FORCES,
         "force_limit_newton": repr(float(params.force_limit)),
         "control_dt_seconds": repr(task.control_dt),
         "learner": str(learner),

@@ -18,9 +18,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import observation_digest
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
+from ballbot_gym.robot import PAPER, ROBOT_FACTORS, ROBOTS, Randomization, Robot, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import REACH, Route
@@ -227,7 +225,7 @@ def farther_choices(obstacles: int) -> tuple[tuple[float, ...], ...]:
 class PolicyController(ActionController):
     """A policy as a Controller of forces, and with Stable-Baselines3's `predict` of actions."""
 
-    def __init__(self, task: Task, params: BallbotParams, network: torch.nn.Module):
+    def __init__(self, task: Task, params: Robot, network: torch.nn.Module):
         """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
         history = getattr(network, "history", 0)
         super().__init__(task, params, self._action_for, history)
@@ -322,8 +320,10 @@ def _check_content(path: Path, spec: PolicySpec, task: Task) -> None:
     Files of earlier versions hold neither, and are compared by name and size alone.
     """
     params = named_robot(spec.robot)
-    if spec.robot_numbers not in ("", repr(params)):
-        own, here = (set(text.split("(", 1)[1].rstrip(")").split(", ")) for text in (spec.robot_numbers, repr(params)))
+    if spec.robot_numbers not in ("", params.record()):
+        own, here = (
+            set(text.split("(", 1)[1].rstrip(")").split(", ")) for text in (spec.robot_numbers, params.record())
+        )
         raise PolicyError(
             f"{path} was trained on a robot {spec.robot!r} with {', '.join(sorted(own - here))}, and the robot of this name "
             f"has {', '.join(sorted(here - own))} here; give the robot that it was trained on, or train again"
@@ -346,9 +346,7 @@ def _read_weights(path: Path) -> dict[str, torch.Tensor]:
         raise PolicyError(f"{path} is not a policy: {error}") from error
 
 
-def load_policy(
-    path: str | Path, task: str | Task | None = None, params: BallbotParams | None = None
-) -> PolicyController:
+def load_policy(path: str | Path, task: str | Task | None = None, params: Robot | None = None) -> PolicyController:
     """The policy of a file as a Controller with SB3's `predict`.
 
     Args:

@@ -14,8 +14,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
 from ballbot_gym.identity import digest, observation_digest
-from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS
-from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
+from ballbot_gym.robot import PAPER, ROBOT_FACTORS, ROBOTS, TRACKS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES, Frame
 
@@ -91,8 +90,8 @@ class PolicySpec:
             raise ValueError(f"task must be text, not {self.task!r}")
         if self.robot not in ROBOTS:
             raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
-        if named_robot(self.robot).wheels is not None and (self.frame is not None or self.mirrors):
-            raise ValueError(f"{self.robot} has three wheels, and neither a frame nor mirror images")
+        if not named_robot(self.robot).SYMMETRIES and (self.frame is not None or self.mirrors):
+            raise ValueError(f"{self.robot} has no symmetry, so its policies have neither a frame nor mirror images")
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
         check_history(self.history)
@@ -173,7 +172,7 @@ class PolicySpec:
     def on(self, task: Task, robot: str) -> "PolicySpec":
         """The same network for a robot by name."""
         params = named_robot(robot)
-        content = {"robot_numbers": repr(params), "observation_digest": observation_digest(task, params)}
+        content = {"robot_numbers": params.record(), "observation_digest": observation_digest(task, params)}
         return replace(self, robot=robot, **content)
 
 

@@ -16,8 +16,8 @@ from gymnasium import spaces
 from ballbot_gym import files
 from ballbot_gym.identity import observation_digest
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.sensors import observation_space
+from ballbot_gym.robot import Robot
+from ballbot_gym.step import observation_space
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.weights import checked, linear_layers, saved_by_torch
@@ -66,7 +66,7 @@ class SavedActor(torch.nn.Module):
         return torch.tanh(action) if self._squashed else action.clamp(-1.0, 1.0)
 
 
-def mark(space: spaces.Space, task: Task, params: BallbotParams) -> None:
+def mark(space: spaces.Space, task: Task, params: Robot) -> None:
     """Adds the digest of a task's observations to the space that models are trained in: their files keep what is added.
 
     `BallbotVecEnv` and `RegretCallback` do so. Models that were trained without them are known by their spaces alone.
@@ -74,7 +74,7 @@ def mark(space: spaces.Space, task: Task, params: BallbotParams) -> None:
     setattr(space, _MARK, observation_digest(task, params))
 
 
-def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> None:
+def check_spaces(name: str, model: Any, task: Task, params: Robot) -> None:
     """Refuses a model that was trained in other spaces, as behind a wrapper that rescales, stacks or converts.
 
     Its `observation_space` and `action_space` are compared with the env's, if it has them, and so is its `mark`.
@@ -109,7 +109,7 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
             )
 
 
-def history_of(model: Any, task: Task, params: BallbotParams) -> int:
+def history_of(model: Any, task: Task, params: Robot) -> int:
     """The number of earlier observations and actions that a model observed, by the size of its observations; else 0.
 
     `check_spaces` refuses other spaces of this size.
@@ -135,7 +135,7 @@ def _in_words(space: Any) -> str:
     return f"{space.shape} {space.dtype} from {space.low.min():g} to {space.high.max():g}"
 
 
-def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
+def fits(path: str | Path, task: Task, params: Robot) -> bool:
     """Whether a saved model takes observations of a task's size, with or without earlier ones.
 
     Raises:
@@ -148,7 +148,7 @@ def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
     return True
 
 
-def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActor:
+def load_actor(path: str | Path, task: Task, params: Robot) -> SavedActor:
     """The deterministic policy of a saved model: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
 
     Args:
@@ -172,7 +172,7 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
     return SavedActor(network, model.squashed, history_of(model, task, params)).eval()
 
 
-def _size(model: Saved, task: Task, params: BallbotParams) -> int:
+def _size(model: Saved, task: Task, params: Robot) -> int:
     """Numbers that an env shows to a model, with the history that the model was trained with."""
     (size,) = observation_space(task, params, history_of(model, task, params)).shape
     return size

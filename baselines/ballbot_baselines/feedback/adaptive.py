@@ -18,8 +18,7 @@ import numpy as np
 from ballbot_baselines.feedback.kalman import SensorFilter, TrackFilter
 from ballbot_baselines.feedback.nmpc import BACKOFF, NmpcController
 from ballbot_baselines.solvers.shooting import Backoff
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import TRACKS
+from ballbot_gym.robot import TRACKS, Robot
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 
@@ -42,9 +41,9 @@ class FilteredController:
     acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, ending: str, controller: Controller):
+    def __init__(self, task: Task, params: Robot, ending: str, controller: Controller):
         self._task, self._params, self._controller = task, params, controller
-        self.senses = params.wheels is not None and ending == "-ekf"
+        self.senses = params.SENSORS and ending == "-ekf"
         self.filter = SensorFilter(task, params) if self.senses else TrackFilter(task, params, _TRACKS[ending])
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
@@ -82,7 +81,7 @@ class AdaptiveNmpcController(FilteredController):
     filter: TrackFilter
     _controller: NmpcController
 
-    def __init__(self, task: Task, params: BallbotParams, ending: str):
+    def __init__(self, task: Task, params: Robot, ending: str):
         self._backoff = BACKOFF if ending == "-adaptive" else _NOISY_BACKOFF
         super().__init__(task, params, ending, NmpcController(task, params, backoff=self._backoff))
 

@@ -11,15 +11,14 @@ import numpy as np
 
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
 from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
-from ballbot_baselines.solvers.shooting import RobotKind, robot_numbers
-from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams
+from ballbot_baselines.solvers.shooting import symbolic
+from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.tasks import Task
 
 _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
 _MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
-_GRIP_UNIT = 0.1  # of `dynamics.limits`; this much costs as much as a unit of a margin
+_GRIP_UNIT = 0.1  # of `Ballbot.limits`; this much costs as much as a unit of a margin
 _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
@@ -82,9 +81,9 @@ class HorizonQp:
     | `curvature` | (N,) | of the friction cone in the inputs, by the multipliers of the last program; 0 before the first |
     """
 
-    def __init__(self, task: Task, kind: RobotKind, nodes: int):
+    def __init__(self, task: Task, kind: Kind, nodes: int):
         """Differentiates the stage and builds the solver; compiles on first use on a machine. `set_robot` must follow."""
-        self._states, self._inputs = kind.states, kind.inputs
+        self._states, self._inputs = len(kind.robot.STATE), len(kind.robot.ACTION)
         count = len(task.margins((0.0,) * self._states, (1.0,) * (len(task.constant_names) + task.clock)))
         self.distinct = np.arange(count)
         self.disturbance: DisturbanceEstimator | None = None
@@ -93,7 +92,7 @@ class HorizonQp:
         self._make_stage(task, kind, nodes, count)
         self._make_program(nodes, self._margins, 2 * kind.grips)
 
-    def _make_stage(self, task: Task, kind: RobotKind, n: int, m: int) -> None:
+    def _make_stage(self, task: Task, kind: Kind, n: int, m: int) -> None:
         states, forces, grips = self._states, self._inputs, 2 * kind.grips
         variables = states + forces
         blocks = -(-n // LANES)  # of intervals; the last one is filled up with zeros
@@ -102,7 +101,7 @@ class HorizonQp:
         def rows(*shape: int) -> np.ndarray:
             return np.zeros((max(n + 1, computed.stop), *shape))
 
-        numbers = rows(1 + len(kind.names))  # an interval's length, and the robot
+        numbers = rows(1 + len(kind.numbers))  # an interval's length, and the robot
         c = rows(len(task.constant_names) + task.clock)
         inputs = [rows(states), rows(forces), numbers, c, *([rows()] if grips else [])]
         outputs = [rows(states), rows(variables, states), rows(variables), rows(m), rows(states, m)]
@@ -164,11 +163,11 @@ class HorizonQp:
         self._h[h.places(slack, slack)], self._g[slack] = _SLACK_CURVATURE, _SLACK_PRICE
         self._high[self._margin_at] = self._high[self._grip_at] = np.inf
 
-    def set_robot(self, params: BallbotParams) -> None:
+    def set_robot(self, params: Robot) -> None:
         """Sets the robot of the model: one of the kind that the program was made for, which rolls and grips or does not."""
-        self._robot[:] = robot_numbers(params)
+        self._robot[:] = params.numbers()
         # of the cone in an input, per multiplier
-        self._cone_curvature = 2 * (params.force_limit / (params.friction * params.weight)) ** 2 / _GRIP_UNIT
+        self._cone_curvature = 2 * params.cone_curvature() / _GRIP_UNIT
 
     def set_weights(self, q: np.ndarray, r: np.ndarray, p: np.ndarray, slope: np.ndarray, target: np.ndarray) -> None:
         """Sets the Hessian and the cost beyond the horizon.
@@ -234,25 +233,25 @@ class HorizonQp:
 
 
 @lru_cache(maxsize=16)
-def horizon_qp(task: Task, kind: RobotKind, nodes: int) -> HorizonQp:
+def horizon_qp(task: Task, kind: Kind, nodes: int) -> HorizonQp:
     """The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
     return HorizonQp(task, kind, nodes)
 
 
 @lru_cache(maxsize=16)
-def _stage_function(task: Task, kind: RobotKind) -> casadi.Function:
+def _stage_function(task: Task, kind: Kind) -> casadi.Function:
     """(x, a, p, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
 
     It computes `LANES` intervals at once, and matrices are columns. p is the interval's length and the robot's numbers.
 
     Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
     """
-    x, a = casadi.SX.sym("x", kind.states), casadi.SX.sym("a", kind.inputs)
-    p = casadi.SX.sym("p", 1 + len(kind.names))
+    x, a = casadi.SX.sym("x", len(kind.robot.STATE)), casadi.SX.sym("a", len(kind.robot.ACTION))
+    p = casadi.SX.sym("p", 1 + len(kind.numbers))
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
-    robot, limit = kind.symbolic(p)
+    robot, limit = symbolic(kind, p)
     z, u, h = casadi.vertcat(x, a), limit * a, p[0]
-    after = dynamics.step(robot, x, u, h, 2)  # two RK4 steps, as the env takes per control step
+    after = robot.step(x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))
     outputs = [
         after,
@@ -266,14 +265,13 @@ def _stage_function(task: Task, kind: RobotKind) -> casadi.Function:
         reserve = casadi.SX.sym("reserve")
         inputs.append(reserve)
         begins, ends = (
-            casadi.vertcat(*dynamics.grip_limits(robot, force, reserve))
-            for force in dynamics.held_contact(robot, x, u, task.control_dt)
+            casadi.vertcat(*robot.grip_limits(force, reserve)) for force in robot.held_contact(x, u, task.control_dt)
         )
         # only the end of a control step that is nearer to slipping: each row costs time
         grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
         outputs += [grip, casadi.vec(casadi.densify(casadi.jacobian(grip, z)))]
     function = casadi.Function("stage", inputs, outputs, {"cse": True})
-    return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if kind.wheels else SIMD)[0]
+    return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if kind.robot.LONG_EQUATIONS else SIMD)[0]
 
 
 def _solver(

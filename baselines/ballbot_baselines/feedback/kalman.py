@@ -8,7 +8,8 @@ sensors are, is the track's: a number that the track does not vary stays what it
 A delay is whole control steps, so there is one filter for each delay that the track may draw. The one whose predictions were
 likeliest is believed.
 
-`SensorFilter` estimates the state and the gyroscope's biases, which is 14 numbers, from what `ballbot_gym.sensors` shows.
+`SensorFilter` estimates the state and the gyroscope's biases, which is 14 numbers, from what
+`ballbot_gym.robot.sensors` shows.
 Readings are of a control step as a whole, so they correct the state in which the step began, and from there the model goes
 on. Before the first of them the filter expects what the task draws, at the place where the episode begins.
 """
@@ -21,10 +22,9 @@ import gymnasium
 import numpy as np
 
 from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
-from ballbot_gym import dynamics, sensors
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
+from ballbot_gym.robot import ROBOT_FACTORS, Randomization, Robot, sensors, substeps_for
+from ballbot_gym.step import observation_space
 from ballbot_gym.tasks import Task
 
 _X, _FACTORS = slice(0, 8), slice(8, 11)
@@ -48,8 +48,8 @@ class TrackFilter:
     | `delay` | (...) | control steps from a command to its force |
     """
 
-    def __init__(self, task: Task, params: BallbotParams, track: Randomization):
-        if params.wheels is not None:
+    def __init__(self, task: Task, params: Robot, track: Randomization):
+        if not params.TRACK_FILTERS:
             raise ValueError(
                 "what a track does not tell is not estimated of a robot with wheels; give lqr, trajopt or nmpc"
             )
@@ -143,26 +143,26 @@ class TrackFilter:
         for age in range(self._delays[-1], 0, -1):  # of commands that have not begun to act, the earliest first
             if (waits := self.delay >= age).any():
                 forces = share * self._commands[age - 1]
-                after = dynamics.step(robot, x, forces, self._dt, dynamics.substeps_for(self._dt))
+                after = robot.step(x, forces, self._dt, substeps_for(self._dt))
                 x = np.where(waits[..., None], after, x)
         return x
 
     @property
-    def robot(self) -> BallbotParams:
+    def robot(self) -> Robot:
         """The estimated robot, on the slipperiest floor of the track; of B episodes its numbers are (B,)."""
         mass, height, force = self.factors.T if self.factors.ndim > 1 else self.factors.tolist()
         return self._track.robot(self._params, (mass, 1.0, height, 1.0, 1.0, 0.0, force, self._track.friction[0]))
 
 
 @lru_cache(maxsize=16)
-def _step_function(params: BallbotParams, dt: float) -> casadi.Function:
+def _step_function(params: Robot, dt: float) -> casadi.Function:
     """(z, commanded force) -> x after a control step of dt, s, in which the force acts, and its Jacobian (8, 17) as a column;
     of `LANES` filters at once.
     """
     z, u = casadi.SX.sym("z", _SIZE), casadi.SX.sym("u", 2)
     mass, height, force = (z[8 + i] for i in range(3))
     robot = Randomization().robot(params, (mass, 1.0, height, 1.0))
-    x = dynamics.step(robot, z[_X], force * u, dt, dynamics.substeps_for(dt))
+    x = robot.step(z[_X], force * u, dt, substeps_for(dt))
     slopes = casadi.vec(casadi.densify(casadi.jacobian(x, z)))
     return in_lanes("filter", (casadi.Function("step", [z, u], [x, slopes], {"cse": True}),))[0]
 
@@ -194,7 +194,7 @@ def readings_variance(dt: float) -> np.ndarray:
     return np.array([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
 
 
-def expected_start(task: Task, params: BallbotParams, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def expected_start(task: Task, params: Robot, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What is expected (14,) where an episode with constants c (nc,) begins, and its standard deviations."""
     draws = np.random.default_rng(0).random((_DRAWN, task.state_draws))
     starts = np.array([task.start(tuple(z), tuple(c), params) for z in draws.tolist()])
@@ -211,7 +211,7 @@ class SensorFilter:
 
     factors, delay = np.ones(3), 0
 
-    def __init__(self, task: Task, params: BallbotParams):
+    def __init__(self, task: Task, params: Robot):
         self._task, self._params, self._dt = task, params, task.control_dt
         self._model, (self._after, self._over_step) = robot_and_sensors(params), _control_step(params, task.control_dt)
         self._noise = np.diag(readings_variance(task.control_dt))
@@ -259,8 +259,8 @@ class StateFromSensors(gymnasium.Wrapper):
         ballbot: Any = env.unwrapped
         if not isinstance(ballbot, BallbotEnv) or ballbot.observation != "sensors" or ballbot.history:
             raise ValueError('StateFromSensors takes a BallbotEnv with observation="sensors" and without history')
-        self._task = ballbot.task
-        self.observation_space = sensors.observation_space(ballbot.task, ballbot.params)
+        self._task, self._params = ballbot.task, ballbot.params
+        self.observation_space = observation_space(ballbot.task, ballbot.params)
         self.filter = SensorFilter(ballbot.task, ballbot.params)
 
     def reset(
@@ -279,26 +279,26 @@ class StateFromSensors(gymnasium.Wrapper):
 
     def _state(self, info: dict[str, Any]) -> np.ndarray:
         c = self._task.at(info["constants"], self._steps * self._task.control_dt)
-        return np.array(self._task.seen(self.filter.x, c), np.float32)
+        return np.array(self._task.seen(self.filter.x, c, self._params), np.float32)
 
 
 @lru_cache(maxsize=16)
-def robot_and_sensors(params: BallbotParams) -> casadi.Function:
+def robot_and_sensors(params: Robot) -> casadi.Function:
     """(x, u) -> rates of the state x (11,) over ideal readings (9,), under the wheels' forces u (3,), N, and their Jacobian
     (20, 11) with respect to x.
     """
     x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
     state, forces = tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(u))
-    found = casadi.vertcat(*dynamics.derivative(params, state, forces), *sensors.ideal(params, state, forces))
+    found = casadi.vertcat(*params.derivative(state, forces), *sensors.ideal(params, state, forces))
     return casadi.Function("robot", [x, u], [found, casadi.densify(casadi.jacobian(found, x))], {"cse": True})
 
 
 @lru_cache(maxsize=16)
-def _control_step(params: BallbotParams, dt: float) -> tuple[casadi.Function, casadi.Function]:
+def _control_step(params: Robot, dt: float) -> tuple[casadi.Function, casadi.Function]:
     """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives
     its Jacobian with respect to x too.
     """
-    model, substeps = robot_and_sensors(params), dynamics.substeps_for(dt)
+    model, substeps = robot_and_sensors(params), substeps_for(dt)
     x, u, own = casadi.MX.sym("x", 11), casadi.MX.sym("u", 3), casadi.DM.eye(11)
     after, slopes, h = x, own, dt / substeps
     for _ in range(substeps):

@@ -5,35 +5,39 @@ from dataclasses import replace
 import numpy as np
 
 from ballbot_baselines.solvers.riccati import closed_gains, discrete_lqr, feedforward, lqr_at_end, tracking_gains
-from ballbot_gym import omni
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 
-def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
+def equilibrium_gain(task: Task, params: Robot) -> tuple[np.ndarray, np.ndarray] | None:
     """LQR in units of observations and actions, for tasks that end at rest in an equilibrium.
 
     Returns:
-        The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
-        of such a task are the scaled errors of the state. With wheels all no observations count: (3, no) and (no, no). None
-        for every other task, and where LQR has no gain.
+        The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first observations of such
+        a task are the scaled errors of the state. Of a robot with outputs all observations count: (3, no) and (no, no).
+        None for every other task, and where LQR has no gain.
     """
     if task.clock:
         return None
     x, c = task.sample(np.random.default_rng(0), params)
     reference = task.reference(x, c, params)
-    if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
+    errors = params.state_size - params.OUTPUT_STATES
+    if (
+        task.first_exit
+        or len(reference.x) > 1
+        or np.abs(np.asarray(task.observe(reference.x[0], c))[:errors]).max() > 0
+    ):
         return None
-    (x,), (u,) = omni.with_wheels(params, reference.x, reference.u)
+    (x,), (u,) = params.extended(reference.x, reference.u)
     try:
         k, p = discrete_lqr(task, params, x, u, c)
     except PlanError:
         return None
-    of_observation = np.zeros((len(x), 8 if params.wheels is None else task.observation_size(params)))
-    of_observation[range(8), range(8)] = task.observation_scale[:8]
-    if params.wheels is not None:  # sin ψ, and the others as `Task.seen` scales them
-        of_observation[range(8, 11), range(-3, 0)] = 1.0, 5.0, 5.0
+    of_observation = np.zeros((len(x), task.observation_size(params) if params.OUTPUTS else errors))
+    of_observation[range(errors), range(errors)] = task.observation_scale[:errors]
+    last = range(-params.OUTPUT_STATES, 0)  # the last outputs are about the remaining components of the state
+    of_observation[range(errors, len(x)), last] = [params.OUTPUT_SCALE[i] for i in last]
     return -k @ of_observation / params.force_limit, of_observation.T @ p @ of_observation
 
 
@@ -47,14 +51,14 @@ class LqrController:
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
     """
 
-    def __init__(self, task: Task, params: BallbotParams):
+    def __init__(self, task: Task, params: Robot):
         self._task, self._params = task, params
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         task, params = self._task, self._params
         self._start = t
-        found = task.reference(x[:8], c, params)
-        states, forces = omni.with_wheels(params, found.x, found.u)
+        found = task.reference(x, c, params)
+        states, forces = params.extended(found.x, found.u)
         self.reference = reference = replace(found, x=states, u=forces)
         if reference.closed:
             self.gains = closed_gains(task, params, reference, c)

@@ -31,9 +31,8 @@ from ballbot_baselines.feedback.tvlqr import TvlqrController
 from ballbot_baselines.optimum.find import plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.linearize import quadratic_cost
-from ballbot_baselines.solvers.shooting import Backoff, RobotKind
-from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams
+from ballbot_baselines.solvers.shooting import Backoff
+from ballbot_gym.robot import Robot, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
@@ -79,7 +78,7 @@ class NmpcController:
     def __init__(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         nodes: int | None = None,
         horizon: float = 1.0,
         iterations: int = 1,
@@ -106,7 +105,7 @@ class NmpcController:
             raise ValueError(f"horizon must be a whole number of control steps of {task.control_dt} s, not {horizon} s")
         nodes = min(nodes or (steps if params.grips else _NODES), steps)
         self._offsets, self._shift_states, self._shift_inputs = grid(steps, nodes)
-        self._qp = horizon_qp(task, RobotKind.of(params), nodes)
+        self._qp = horizon_qp(task, params.kind, nodes)
         self.plan: Optimum | None = None
         self.disturbance: DisturbanceEstimator | None = None
         self.counts = Counts()
@@ -118,7 +117,7 @@ class NmpcController:
         self.disturbance = DisturbanceEstimator(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
 
-    def adapt(self, params: BallbotParams) -> None:
+    def adapt(self, params: Robot) -> None:
         """Goes on with the model of another robot of the same kind. The plan stays."""
         self._params = params
 
@@ -169,8 +168,7 @@ class NmpcController:
         if not self._params.grips:
             return 0.0
         x, u = self._trajectory.x, self._trajectory.u
-        forces = dynamics.held_contact(self._params, x[:-1], u, self._task.control_dt)
-        least = min(np.min(dynamics.grip_reserve(self._params, force)) for force in forces)
+        least = np.min(self._params.grip_reserve(x[:-1], u, self._task.control_dt))
         return float(np.clip(least, 0.0, self.backoff.grip))
 
     def _estimate(self, x: np.ndarray) -> None:
@@ -178,7 +176,7 @@ class NmpcController:
         if self.disturbance is None or self._before is None or not np.isfinite(x).all():
             return
         dt = self._task.control_dt
-        expected = dynamics.step(self._params, *self._before, dt, dynamics.substeps_for(dt))
+        expected = self._params.step(*self._before, dt, substeps_for(dt))
         self.disturbance.fit(*self._before, (x - expected)[4:] / dt)
 
     def _found_new_plan(self, t: float, x: np.ndarray) -> bool:
@@ -242,6 +240,6 @@ class NmpcController:
         return self._params.force_limit * self._guess_a[0] - gain @ (x - self._guess_x[0])
 
 
-def offset_free_nmpc(task: Task, params: BallbotParams) -> NmpcController:
+def offset_free_nmpc(task: Task, params: Robot) -> NmpcController:
     """NMPC that estimates how the robot differs from the model, and keeps more distance from its limits."""
     return NmpcController(task, params, backoff=_OFFSET_FREE_BACKOFF, offset_free=True)

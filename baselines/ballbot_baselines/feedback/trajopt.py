@@ -1,15 +1,12 @@
 """Trajectory optimization as a controller: plan at reset, track with TVLQR."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from ballbot_baselines.feedback.tvlqr import TvlqrController
 from ballbot_baselines.optimum.find import plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.shooting import Backoff
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import TRACKS
+from ballbot_gym.robot import TRACKS, Robot
 from ballbot_gym.tasks import Task
 
 EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02, grip=0.1)
@@ -28,7 +25,7 @@ class TrajoptController:
     plan.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
+    def __init__(self, task: Task, params: Robot, backoff: Backoff = EXECUTED):
         self._task, self._params, self._backoff = task, params, backoff
         self.plan: Optimum | None = None
 
@@ -41,9 +38,9 @@ class TrajoptController:
         return self._tracker.act(t, x)
 
 
-def cautious_trajopt(task: Task, params: BallbotParams) -> TrajoptController:
+def cautious_trajopt(task: Task, params: Robot) -> TrajoptController:
     """`TrajoptController` for the nominal robot with the least force and friction of the track "unknown".
 
     Its plans leave force and room for feedback on all robots of that track.
     """
-    return TrajoptController(task, replace(params, friction=params.friction * _LEAST_FRICTION), _CAUTIOUS)
+    return TrajoptController(task, params.varied(friction=_LEAST_FRICTION), _CAUTIOUS)

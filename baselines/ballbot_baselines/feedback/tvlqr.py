@@ -3,7 +3,7 @@
 import numpy as np
 
 from ballbot_baselines.solvers.riccati import Gains, held_steps, lqr_at_end, tracking_gains
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -32,7 +32,7 @@ class TvlqrController:
     def for_task(
         cls,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         trajectory: Trajectory,
         c: np.ndarray | tuple = (),
         end: tuple[np.ndarray, np.ndarray] | None = None,

@@ -28,10 +28,10 @@ from ballbot_baselines.optimum.guesses import BASIN_DOUBT, COARSE, CONSIDERED, c
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers import guess, righting
 from ballbot_baselines.solvers.ilqr import MARGIN, Motions, Options, ilqr
-from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
+from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
 from ballbot_gym import machine_code
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import sides_passed
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -66,9 +66,9 @@ _FEW = 16  # problems
 _AT_ONCE = 256  # episodes in memory
 
 
-def solves(task: Task, params: BallbotParams) -> bool:
+def solves(task: Task, params: Robot) -> bool:
     """Whether `search_many` can solve this task here: C code can be compiled, it has all operations of the task, the task has
-    no clock, and the robot no wheels.
+    no clock, and the robot has `BATCHED_OPTIMA`.
     """
     try:
         ilqr(task, params)
@@ -77,9 +77,7 @@ def solves(task: Task, params: BallbotParams) -> bool:
     return True
 
 
-def search_many(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff
-) -> list[Optimum | None]:
+def search_many(task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff) -> list[Optimum | None]:
     """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
 
     Raises:
@@ -93,7 +91,7 @@ def search_many(
 class _Batch:
     """The search of some episodes."""
 
-    def __init__(self, task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff):
+    def __init__(self, task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff):
         self._task, self._params, self._x0, self._c, self._backoff = task, params, x0, c, backoff
         self._solver = ilqr(task, params)
         self._costs = np.full(len(x0), np.inf)
@@ -157,7 +155,7 @@ class _Batch:
         c = (self._c if c is None else c)[of]
         _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
         rows = np.tile(given, (len(c), 1))
-        first = len(robot_numbers(self._params))
+        first = len(self._params.numbers())
         rows[:, first : first + c.shape[1]] = c
         if free_time:
             bounds = self._task.control_dt / 4, self._task.duration / FREE_TIME_INTERVALS

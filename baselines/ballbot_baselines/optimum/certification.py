@@ -17,13 +17,10 @@ from ballbot_baselines.optimum.guesses import COARSE
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.compiled import LANES
 from ballbot_baselines.solvers.shooting import Backoff
-from ballbot_gym import dynamics
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import PAPER, checked_robot
+from ballbot_gym.robot import PAPER, Randomization, Robot, checked_robot, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -35,7 +32,7 @@ AT_ONCE = LANES
 def entries(
     task: str | Task,
     indices: Iterable[int],
-    robot: str | BallbotParams = PAPER,
+    robot: str | Robot = PAPER,
     randomization: Randomization = Randomization(),
 ) -> Iterator[tuple[int, EvaluationSet | str]]:
     """Solves episodes of a task: yields the number of each, and a set of it alone with its optimum, or why none was found.
@@ -72,7 +69,7 @@ def entries(
 
 def _solved(
     task: Task,
-    params: BallbotParams,
+    params: Robot,
     randomization: Randomization,
     x0: np.ndarray,
     c: np.ndarray,
@@ -106,7 +103,7 @@ def _optimal(*problem: Any, twice: bool | Optimum = True, **options: Any) -> Opt
 
 def optimum_of(
     task: Task,
-    params: BallbotParams,
+    params: Robot,
     x0: np.ndarray,
     c: np.ndarray,
     randomization: Randomization,
@@ -136,9 +133,9 @@ def optimum_of(
     for k in range(delay):
         began = task.at(c, k * dt)
         cost += dt * float(task.cost(states[-1], none, began))
-        states.append(np.array(dynamics.step(params, states[-1], none, dt, dynamics.substeps_for(dt))))
+        states.append(np.array(params.step(states[-1], none, dt, substeps_for(dt))))
         violated = task.violated(states[-1], task.at(c, (k + 1) * dt))
-        if violated or min(dynamics.limits(params, states[-2], none, hold=dt), default=1.0) < 0:
+        if violated or min(params.limits(states[-2], none, hold=dt), default=1.0) < 0:
             raise PlanError(f"{task.id}: the limit of {violated or 'grip'} is violated before a force can come")
     rest, start = replace(task, duration=dt * (task.steps - delay)), delay * dt
     paths = None
@@ -163,7 +160,7 @@ def _delayed(optimum: Optimum, steps: int) -> np.ndarray:
     return np.pad(optimum.gains, ((steps, 0), (0, 0), (0, 0)))
 
 
-def arrays(entries: Mapping[int, EvaluationSet | str], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:
+def arrays(entries: Mapping[int, EvaluationSet | str], task: Task, params: Robot) -> dict[str, np.ndarray]:
     """The entries of any episodes as arrays, for sets too large for an `EvaluationSet`.
 
     | array | shape | holds |

@@ -23,8 +23,7 @@ from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_baselines.solvers.shooting import Backoff, Shooting
 from ballbot_gym.checks import finite_array
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import checked_robot
+from ballbot_gym.robot import Robot, checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -35,7 +34,7 @@ _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, fro
 
 def find_optimum(
     task: str | Task,
-    params: str | BallbotParams,
+    params: str | Robot,
     x0: np.ndarray,
     c: np.ndarray,
     backoff: Backoff = Backoff(),
@@ -49,7 +48,7 @@ def find_optimum(
     Args:
         task: the problem, or its name in `TASKS`.
         params: the robot, or its name in `ROBOTS`.
-        x0: (8,) initial state, m, rad, m/s, rad/s; order in `dynamics.STATE`; (11,) with wheels.
+        x0: (8,) initial state, m, rad, m/s, rad/s; order in `Ballbot.STATE`; (11,) with wheels.
         c: (nc,) constants of the episode, named in the task's `constant_names`; (0,) where it has none.
         backoff: distance kept from limits; none for the true optimum.
         guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
@@ -107,7 +106,7 @@ def find_optimum(
 
 def find_optima(
     task: str | Task,
-    params: str | BallbotParams,
+    params: str | Robot,
     x0: np.ndarray,
     c: np.ndarray,
     backoff: Backoff = Backoff(),
@@ -160,7 +159,7 @@ def _cheaper(episode: Shooting, found: Optimum, cost: float) -> list[Solution]:
 
 
 def plan_to_track(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
+    task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
 ) -> Optimum:
     """As `find_optimum`, for feedback to track. Where no plan keeps the whole reserve of force and friction, it keeps less.
 

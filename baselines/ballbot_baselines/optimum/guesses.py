@@ -4,10 +4,10 @@ their rough solutions they solve in full.
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, then_stay
 from ballbot_gym.tasks import Task
 
@@ -25,12 +25,12 @@ _SIDE_DOUBT = 0.01
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 
 
-def side_doubt(params: BallbotParams) -> float:
+def side_doubt(params: Any) -> float:
     """Choices of sides whose predicted cost exceeds the best by more than this share are not solved."""
     return GRIPPING_DOUBT if params.grips else _SIDE_DOUBT
 
 
-def straight_path(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
+def straight_path(task: Task, params: Any, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
     """(steps+1, 2) m, from the position and velocity of x0 to rest where the task's reference ends."""
     goal = task.reference(x0, c, params).x[-1, :2]
     steps = min(task.steps, round(_STRAIGHT_SECONDS / task.control_dt))

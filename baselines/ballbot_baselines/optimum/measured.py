@@ -7,13 +7,11 @@ import numpy as np
 
 from ballbot_baselines.optimum.find import find_optimum
 from ballbot_baselines.optimum.optimum import Optimum
-from ballbot_gym import dynamics
 from ballbot_gym.checks import finite_array
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, checked_robot
+from ballbot_gym.robot import PAPER, Robot, checked_robot, substeps_for
+from ballbot_gym.step import limit_names, outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_gym.trajectory import Trajectory
 
 _SAME_TIME = 1e-9  # s: times that differ by less are one
@@ -51,17 +49,17 @@ class Regret:
 def regret(
     trajectory: Trajectory | tuple[np.ndarray, ...],
     task: str | Task,
-    robot: str | BallbotParams = PAPER,
+    robot: str | Robot = PAPER,
     constants: Sequence[float] | np.ndarray = (),
 ) -> Regret:
     """The regret of a trajectory from any source, such as another simulator or a robot.
 
     Args:
         trajectory: a Trajectory, or arrays (t, x, u): t (N+1,) s, at any increasing times; x (N+1, 8) states, order and units
-            in `dynamics.STATE`; u (N, 2) N, each held until the next time, or (N+1, 2), linear between times. It may begin
+            in `Ballbot.STATE`; u (N, 2) N, each held until the next time, or (N+1, 2), linear between times. It may begin
             at any time, and go on after the episode's end.
         task: a name in `TASKS`, or any Task.
-        robot: a name in `ROBOTS`, or any BallbotParams.
+        robot: a name in `ROBOTS`, or any Robot.
         constants: (nc,) of the episode, named in the task's `constant_names`.
 
     Raises:
@@ -100,13 +98,13 @@ def regret(
     )
 
 
-def _end(task: Task, params: BallbotParams, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> tuple[int, str, bool]:
+def _end(task: Task, params: Robot, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> tuple[int, str, bool]:
     """The control step at which an episode through states x (n+1, 8) ends, the violated limit, and whether it succeeds."""
     if start := task.violated(x[0], task.at(c, 0.0)):
         raise ValueError(f"{task.id}: the trajectory starts beyond the limit of {start}")
     steps, dt = np.arange(1, len(x)), task.control_dt
     force = np.array([moved.force((k - 0.5) * dt) for k in steps]).reshape(-1, params.action_size)
-    limits = dynamics.limits(params, x[:-1], force, hold=dt)
+    limits = params.limits(x[:-1], force, hold=dt)
     did = outcome(task, x[:-1], force, x[1:], c, steps, (np.minimum.reduce(limits),) if limits else ())
     ended = np.flatnonzero(np.broadcast_to(did.terminated + did.truncated, steps.shape))
     if not len(ended):
@@ -131,12 +129,12 @@ def _cost(task: Task, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> float:
     return float(np.sum(np.diff(edges) * np.broadcast_to(rates, len(middles))))
 
 
-def _defects(params: BallbotParams, moved: Trajectory) -> np.ndarray:
+def _defects(params: Robot, moved: Trajectory) -> np.ndarray:
     """(N, 8) recorded states less those that the equations make of the ones before."""
     dt, x = np.diff(moved.t), moved.x[:-1]
-    parts = dynamics.substeps_for(dt.max()) * (1 if moved.held else _LINEAR_STEPS)
+    parts = substeps_for(dt.max()) * (1 if moved.held else _LINEAR_STEPS)
     for i in range(parts):
         share = (i + 0.5) / parts
         force = moved.u if moved.held else (1 - share) * moved.u[:-1] + share * moved.u[1:]
-        x = dynamics.step(params, x, force, dt / parts, 1)
+        x = params.step(x, force, dt / parts, 1)
     return np.asarray(moved.x[1:] - x)

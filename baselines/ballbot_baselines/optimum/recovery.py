@@ -21,7 +21,7 @@ import numpy as np
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
 from ballbot_baselines.solvers.shooting import Backoff, kind_of, ocp_of, shooting_parameters
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
 _LEAN = 2  # index of γ in a state
@@ -34,7 +34,7 @@ _STEEP = math.radians(55)  # the lean of the recovery that the search starts fro
 _PATIENCE = 3  # the search stops after this many values in a row without a recoverable lean
 
 
-def largest_leans(task: Task, params: BallbotParams, component: int, values: np.ndarray) -> np.ndarray:
+def largest_leans(task: Task, params: Robot, component: int, values: np.ndarray) -> np.ndarray:
     """For each value of one component of the initial state, the largest lean γ from which the goal can be reached.
 
     Args:
@@ -77,7 +77,7 @@ def _solve(solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, valu
     return solver.solve(x, a, lower, upper, p)
 
 
-def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
+def _sideways(task: Task, params: Robot) -> tuple[np.ndarray, np.ndarray] | None:
     """A simulated recovery from a large lean that first leans to one side, if there is one."""
     x0 = np.zeros(8)
     x0[_LEAN] = _STEEP
@@ -87,7 +87,7 @@ def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray
     return None
 
 
-def _largest_lean_ocp(task: Task, params: BallbotParams) -> Ocp:
+def _largest_lean_ocp(task: Task, params: Robot) -> Ocp:
     """The task's problem with a free initial lean. The ninth state carries that lean to the end, where it is the reward."""
     fixed = ocp_of(*kind_of(task, params))
     price = _REGULARIZATION * task.control_dt

@@ -23,7 +23,6 @@ from ballbot_baselines.optimum.guesses import (
 from ballbot_baselines.solvers import guess, righting
 from ballbot_baselines.solvers.ocp import Solution
 from ballbot_baselines.solvers.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
-from ballbot_gym import dynamics
 from ballbot_gym.paths import sides_passed
 
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
@@ -141,7 +140,7 @@ def _simulated(episode: Shooting, x: np.ndarray, u: np.ndarray, cost: float) -> 
     t = episode.start + task.control_dt * np.arange(len(x))
     room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(x[-1], task.at(c, t[-1]))]
     room += [np.asarray(margin) - backoff.margin for margin in task.margins(x, task.at(c, t))]
-    room += dynamics.limits(params, x[:-1], u, backoff.grip, task.control_dt)
+    room += params.limits(x[:-1], u, backoff.grip, task.control_dt)
     return Solution(
         success=False,
         status="simulated feedback",

@@ -14,14 +14,14 @@ that costs at most 0.1 % more, had a predicted cost at most 0.7 % above the lowe
 """
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from ballbot_baselines.solvers.linearize import discretize, quadratic_cost
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
 _ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
@@ -55,7 +55,7 @@ class Prediction:
 
 
 def predict(
-    task: Task, params: BallbotParams, x0: np.ndarray, goal_y: np.ndarray, along: np.ndarray, obstacles: np.ndarray
+    task: Task, params: Any, x0: np.ndarray, goal_y: np.ndarray, along: np.ndarray, obstacles: np.ndarray
 ) -> Prediction:
     """Predicts every choice of sides, in B slaloms at once.
 
@@ -81,11 +81,11 @@ def predict(
 
 
 @lru_cache(maxsize=8)
-def _model(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+def _model(task: Task, params: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the motion across the way: (steps+1, 4) positions without obstacles by initial state, and (steps+1, steps) impulse
     responses divided by √s.
     """
-    params = replace(params, wheels=None)  # with wheels it moves nearly as without
+    params = params.ideal()  # with wheels it moves nearly as without
     dt, rest = task.control_dt, np.zeros((1, 8))
     a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
     a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]

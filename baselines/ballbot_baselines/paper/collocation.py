@@ -4,7 +4,7 @@
     subject to  Hermite–Simpson:  the cubic through (x_n, f_n) and (x_{n+1}, f_{n+1}) obeys the dynamics at mid-interval,
                                   with u linear between knots
                 equalities(x_n, u_n, q) = 0,  inequalities(x_n, u_n, q) ≥ 0 at every knot
-                limits(x_n, u_n) ≥ 0 at every knot, where the robot's friction is limited (`dynamics.limits`)
+                limits(x_n, u_n) ≥ 0 at every knot, where the robot's friction is limited (`Ballbot.limits`)
                 bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
 
 This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot without
@@ -22,8 +22,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from ballbot_baselines.solvers.ocp import ACCEPTABLE, Ocp, OcpSolver, Solution, no_path
-from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Ballbot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
@@ -32,7 +31,7 @@ _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation erro
 
 @dataclass(frozen=True)
 class Problem:
-    """A trajectory optimization problem as plain data. Vectors are in SI units, in the order of `dynamics.STATE`."""
+    """A trajectory optimization problem as plain data. Vectors are in SI units, in the order of `Ballbot.STATE`."""
 
     name: str
     cost: Callable[[Any, Any, Any, Any], Any]
@@ -96,7 +95,7 @@ def _free(problem: Problem) -> slice:
     return slice(_H + 1, _H + 1 + len(problem.free))
 
 
-def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
+def hermite_simpson(problem: Problem, params: Ballbot) -> Ocp:
     """The staged problem whose dynamics and equality constraints are Hermite–Simpson's."""
     q, limit = _free(problem), params.force_limit
     start = slice(q.stop, q.stop + 8 * problem.periodic)
@@ -104,9 +103,9 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
     def interval(s: casadi.SX, w: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
         """The next [x, u/limit], and the defects of its components from the leans on."""
         x0, u0, h, x1, u1 = s[_X], limit * s[_A], s[_H], casadi.vertcat(0, 0, w[:6]), limit * w[6:]
-        f0, f1 = dynamics.derivative(params, x0, u0), dynamics.derivative(params, x1, u1)
+        f0, f1 = params.derivative(x0, u0), params.derivative(x1, u1)
         middle = 0.5 * (x0 + x1) + h / 8 * (f0 - f1)
-        f_middle = dynamics.derivative(params, middle, 0.5 * (u0 + u1))
+        f_middle = params.derivative(middle, 0.5 * (u0 + u1))
         reached = x0 + h / 6 * (f0 + 4 * f_middle + f1)
         return casadi.vertcat(reached[:2], w), w[:6] - reached[2:]
 
@@ -115,7 +114,7 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
 
     def inequalities(s: casadi.SX) -> casadi.SX:
         asked = path(problem.inequalities, s)
-        return casadi.vertcat(asked, *dynamics.limits(params, s[_X], limit * s[_A])) if params.grips else asked
+        return casadi.vertcat(asked, *params.limits(s[_X], limit * s[_A])) if params.grips else asked
 
     initial = None
     if problem.periodic:  # x_start is x_0
@@ -136,9 +135,7 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
     )
 
 
-def solve(
-    problem: Problem, params: BallbotParams, guess: Guess, solver: str = "ipopt", max_iterations: int = 500
-) -> Plan:
+def solve(problem: Problem, params: Ballbot, guess: Guess, solver: str = "ipopt", max_iterations: int = 500) -> Plan:
     """Solves a problem from a guess, which should be roughly a motion.
 
     From a straight line between two states the solvers take up to 12 times as many iterations, or stop at an infeasible
@@ -177,17 +174,17 @@ def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
     for i, (low, high) in enumerate(problem.free):
         lower[0, _H + 1 + i], upper[0, _H + 1 + i] = low, high
     for knot, i in np.argwhere(lower > upper)[:1]:
-        name, low, high = dynamics.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
+        name, low, high = Ballbot.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
         raise PlanError(
             f"{problem.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
         )
     return lower, upper
 
 
-def _plan(problem: Problem, params: BallbotParams, result: Solution, seconds: float) -> Plan:
+def _plan(problem: Problem, params: Ballbot, result: Solution, seconds: float) -> Plan:
     x, u = result.states[:, _X], params.force_limit * result.states[:, _A]
     t = result.states[0, _H] * np.arange(len(x))
-    trajectory = Trajectory(t, x, u, xdot=dynamics.derivative(params, x, u))
+    trajectory = Trajectory(t, x, u, xdot=params.derivative(x, u))
     return Plan(
         cost=result.cost,
         trajectory=trajectory,
@@ -201,12 +198,12 @@ def _plan(problem: Problem, params: BallbotParams, result: Solution, seconds: fl
     )
 
 
-def collocation_error(params: BallbotParams, trajectory: Trajectory) -> float:
+def collocation_error(params: Ballbot, trajectory: Trajectory) -> float:
     """The largest ∫|ẋ − f(x, u)| dt over an interval and a state component, for x cubic and u linear between knots."""
     t, u = trajectory.t, trajectory.u
     step = np.diff(t)
     inner = (t[:-1, None] + step[:, None] * _INTERIOR).ravel()
     spline = CubicHermiteSpline(t, trajectory.x, trajectory.xdot)
     forces = np.column_stack([np.interp(inner, t, u[:, i]) for i in range(2)])
-    residual = np.abs(spline(inner, 1) - dynamics.derivative(params, spline(inner), forces))
+    residual = np.abs(spline(inner, 1) - params.derivative(spline(inner), forces))
     return float((residual.reshape(len(step), len(_INTERIOR), 8).mean(axis=1) * step[:, None]).max())

@@ -20,8 +20,8 @@ from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic
+from ballbot_gym.robot import Ballbot
 from ballbot_gym.rollout import Episode, rollout, simulate
 from ballbot_gym.tasks.orbit import steady_orbit
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -50,11 +50,11 @@ class PaperProblem:
     title: str
     figure: str
     problem: Problem
-    guess: Callable[[BallbotParams], Guess]
+    guess: Callable[[Ballbot], Guess]
     obstacles: tuple[tuple[float, float, float], ...] = ()
     """x, y and the distance that the ball's centre keeps, m."""
 
-    def solve(self, params: BallbotParams, solver: str = "ipopt") -> Plan:
+    def solve(self, params: Ballbot, solver: str = "ipopt") -> Plan:
         """The optimum.
 
         Raises:
@@ -125,14 +125,14 @@ def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Probl
 
 
 def hermite_guess(
-    params: BallbotParams, x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int = INTERVALS
+    params: Ballbot, x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int = INTERVALS
 ) -> Guess:
     """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces; duration in s."""
     path = cubic(x0[:2], x0[4:6], x1[:2], x1[4:6], intervals, duration / intervals)
     return _along(params, path, x0, x1, duration)
 
 
-def _along(params: BallbotParams, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
+def _along(params: Ballbot, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
     """Zero forces, and states along a ground path (intervals+1, 2), m, from x0 to x1."""
     h = duration / (len(path) - 1)
     x, _ = along_path(params, path, h)
@@ -140,14 +140,14 @@ def _along(params: BallbotParams, path: np.ndarray, x0: np.ndarray, x1: np.ndarr
     return Guess(x, np.zeros((len(path), 2)), h)
 
 
-def _orbit_guess(params: BallbotParams, speed: float, radius: float) -> Guess:
+def _orbit_guess(params: Ballbot, speed: float, radius: float) -> Guess:
     bearings = np.pi / 2 + np.linspace(0, 2 * np.pi, INTERVALS + 1)
     x, u = steady_orbit(params, radius, speed, bearings)
     return Guess(x, u, 2 * np.pi * radius / speed / INTERVALS, (radius,))
 
 
 def _weave_guess(
-    params: BallbotParams, x0: np.ndarray, x1: np.ndarray, via: tuple[tuple[float, float], ...], duration: float
+    params: Ballbot, x0: np.ndarray, x1: np.ndarray, via: tuple[tuple[float, float], ...], duration: float
 ) -> Guess:
     """A spline that passes each obstacle on a chosen side, leans from its accelerations, zero forces."""
     from scipy.interpolate import CubicSpline
@@ -215,7 +215,7 @@ PAPER_PROBLEMS: dict[str, PaperProblem] = {
 """The paper's experiments by name."""
 
 
-def track_plan(plan: Plan, params: BallbotParams) -> tuple[Trajectory, float]:
+def track_plan(plan: Plan, params: Ballbot) -> tuple[Trajectory, float]:
     """A plan's execution under TVLQR, in PyBullet where it is installed, with the weights of the paper's cost.
 
     Returns:

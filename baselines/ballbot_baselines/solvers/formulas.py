@@ -6,7 +6,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
 _SEGMENTS, _POINTS = 32, 401  # straight lines through states near starts, and points of each
@@ -18,7 +18,7 @@ _ADVICE = (
 )
 
 
-def check_formulas(task: Task, params: BallbotParams) -> None:
+def check_formulas(task: Task, params: Robot) -> None:
     """Checks cost, margins and goal of a task near some of its starts.
 
     Raises:

@@ -1,16 +1,15 @@
 """Initial guesses for trajectory optimization."""
 
+from typing import Any
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-
-from ballbot_gym import omni
-from ballbot_gym.params import BallbotParams
 
 _SMOOTHING = 0.15  # s: shorter turns of a guessed path are rounded off, because the body cannot follow them
 
 
 def along_path(
-    params: BallbotParams, path: np.ndarray, dt: float | np.ndarray, start: np.ndarray | None = None
+    params: Any, path: np.ndarray, dt: float | np.ndarray, start: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """States and forces that approximately follow ground paths, one or many of a length.
 
@@ -33,7 +32,7 @@ def along_path(
     lean = np.clip(np.stack([gamma, theta], axis=-1), -1.0, 1.0)
     x = np.concatenate([path, lean, velocity, np.gradient(lean, axis=-2) / step], axis=-1)
     u = np.clip(params.moving_mass * acceleration[..., :-1, :], -params.force_limit, params.force_limit)
-    x, u = omni.with_wheels(params, x, u)
+    x, u = params.extended(x, u)
     if start is not None:
         x[..., 0, :] = start
     return x, u

@@ -25,9 +25,9 @@ import numpy as np
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.compiled import LANES, SIMD
 from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium
-from ballbot_baselines.solvers.shooting import RobotKind, kind_of, ocp_of
-from ballbot_gym import codegen, dynamics, machine_code, ops
-from ballbot_gym.params import BallbotParams
+from ballbot_baselines.solvers.shooting import kind_of, ocp_of, symbolic
+from ballbot_gym import codegen, machine_code, ops
+from ballbot_gym.robot import Kind, Robot, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
@@ -118,7 +118,7 @@ class _Rest:
         return 0.5 * (self.slopes(off) * off).sum(axis=-1)
 
 
-def _rest(task: Task, params: BallbotParams) -> _Rest | None:
+def _rest(task: Task, params: Robot) -> _Rest | None:
     """LQR where the task ends, if that is at rest, and the same relative to the end of every episode."""
     if task.first_exit:
         return None
@@ -141,15 +141,17 @@ class _Ilqr:
 
     Raises:
         machine_code.NoMachineCodeError: it cannot be compiled here.
-        NotImplementedError: the task has an operation that `codegen` does not know, or a clock; or the robot has wheels.
+        NotImplementedError: the task has an operation that `codegen` does not know, or a clock; or the
+            robot has no `BATCHED_OPTIMA`.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
+    def __init__(self, task: Task, params: Robot, free_time: bool = False):
         if task.clock:
             raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
-        if params.wheels is not None:
+        if not params.BATCHED_OPTIMA:
             raise NotImplementedError(
-                "many optima at once know no robot with wheels; find_optimum solves them one by one"
+                f"many optima at once do not support {type(params).__name__}, see Robot.BATCHED_OPTIMA; find_optimum solves "
+                "them one by one"
             )
         kind = kind_of(task, params)  # which refuses formulas that cannot be optimized
         self._limit, self.rest = params.force_limit, None if free_time else _rest(task, params)
@@ -234,7 +236,7 @@ ilqr = functools.lru_cache(maxsize=8)(_Ilqr)
 
 
 @functools.cache
-def _compiled(task: Task, kind: RobotKind, free_time: bool, rests: bool) -> tuple[ctypes.CDLL, dict[str, int]]:
+def _compiled(task: Task, kind: Kind, free_time: bool, rests: bool) -> tuple[ctypes.CDLL, dict[str, int]]:
     """The functions of ilqr.c for a task and a kind of robot, and the sizes that they were made for."""
     stage, name = _Stage(task, kind, free_time, rests), f"{task.id}-ilqr{'-free' if free_time else ''}"
     return ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.sizes
@@ -243,16 +245,16 @@ def _compiled(task: Task, kind: RobotKind, free_time: bool, rests: bool) -> tupl
 class _Stage:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
-    def __init__(self, task: Task, kind: RobotKind, free_time: bool, rests: bool):
+    def __init__(self, task: Task, kind: Kind, free_time: bool, rests: bool):
         self._ocp = ocp_of(task, kind, free_time)
-        self._substeps = dynamics.substeps_for(task.control_dt)
+        self._substeps = substeps_for(task.control_dt)
         self._free, self.ns, self._rests = free_time, 9 if free_time else 8, rests
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
         self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
         self._all = casadi.vertcat(self._x[8] if free_time else self._dt, self._p[: self._ocp.params - 1])
         self._limit: Any
-        self._robot, self._limit = kind.symbolic(self._all)
+        self._robot, self._limit = symbolic(kind, self._all)
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
         path, end = (
@@ -278,7 +280,7 @@ class _Stage:
         return "\n".join([*defined, codegen.text("real.h"), *blocks, own])
 
     def _after(self, x: casadi.SX, a: casadi.SX, substeps: int) -> casadi.SX:
-        return casadi.vertcat(dynamics.step(self._robot, x[:8], self._limit * a, self._all[0], substeps), x[8:])
+        return casadi.vertcat(self._robot.step(x[:8], self._limit * a, self._all[0], substeps), x[8:])
 
     def _sweep(self) -> str:
         """One control step of the Riccati recursion.

@@ -5,19 +5,18 @@ from functools import cache, lru_cache
 import casadi
 import numpy as np
 
-from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot, substeps_for
 from ballbot_gym.tasks import Task
 
 _YAW_WEIGHT = 0.1  # of ψ², ψ̇² and ω_z², SI units, 1/s
 
 
-def discretize(params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+def discretize(params: Robot, x: np.ndarray, u: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Linearizes the control step (force held for dt s, RK4) about points of a trajectory.
 
     Args:
         params: the robot.
-        x: (n, 8) states; order and units in `dynamics.STATE`. With wheels they have 11 components, and forces have 3.
+        x: (n, 8) states; order and units in `Ballbot.STATE`. With wheels they have 11 components, and forces have 3.
         u: (n, 2) forces, N.
         dt: s.
 
@@ -70,10 +69,10 @@ def _constants(task: Task, c: np.ndarray, t: np.ndarray | float, n: int) -> np.n
 
 
 @lru_cache(maxsize=64)  # controllers that estimate their robot come with many
-def _jacobians(params: BallbotParams, dt: float) -> casadi.Function:
+def _jacobians(params: Robot, dt: float) -> casadi.Function:
     """Of the state after a control step of dt, s."""
     x, u = casadi.SX.sym("x", params.state_size), casadi.SX.sym("u", params.action_size)
-    out = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
+    out = params.step(x, u, dt, substeps_for(dt))
     outputs = [casadi.densify(casadi.jacobian(out, x)), casadi.densify(casadi.jacobian(out, u))]
     return casadi.Function("jacobians", [x, u], outputs, {"cse": True})
 

@@ -10,8 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from ballbot_baselines.solvers.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
-from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Reference, Task
 from ballbot_gym.trajectory import Trajectory
@@ -30,7 +29,7 @@ class Gains:
 
 
 def discrete_lqr(
-    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: float = 0.0
+    task: Task, params: Robot, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx.
 
@@ -48,13 +47,13 @@ def discrete_lqr(
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 
 
-def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
+def is_equilibrium(params: Robot, x: np.ndarray, u: np.ndarray) -> bool:
     """Whether state x (8,) stays where it is under force u (2,), to 1e-6."""
-    return bool(np.abs(dynamics.derivative(params, np.asarray(x), np.asarray(u))).max() < 1e-6)
+    return bool(np.abs(params.derivative(np.asarray(x), np.asarray(u))).max() < 1e-6)
 
 
 def lqr_at_end(
-    task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, t: float = 0.0
+    task: Task, params: Robot, x: np.ndarray, c: np.ndarray, t: float = 0.0
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """K (2, 8) and P (8, 8) where a trajectory ends: LQR's at an equilibrium, else None and `_GOAL_PRICE` per squared goal
     tolerance.
@@ -88,7 +87,7 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final
 
 def tracking_gains(
     task: Task,
-    params: BallbotParams,
+    params: Robot,
     x: np.ndarray,
     u: np.ndarray,
     c: np.ndarray,
@@ -102,7 +101,7 @@ def tracking_gains(
     return _riccati(*_steps(task, params, x, u, c, start), p_final)
 
 
-def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
+def closed_gains(task: Task, params: Robot, reference: Reference, c: np.ndarray) -> Gains:
     """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
     steps, after = _steps(task, params, reference.x, reference.u, c), np.eye(reference.x.shape[1])
     for _ in range(_MAX_ROUNDS):
@@ -114,7 +113,7 @@ def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.
 
 
 def _steps(
-    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, start: float = 0.0
+    task: Task, params: Robot, x: np.ndarray, u: np.ndarray, c: np.ndarray, start: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What `_riccati` takes of the control steps at states x (n, 8) and forces u (n, 2)."""
     dt = task.control_dt
@@ -123,7 +122,7 @@ def _steps(
 
 
 def feedforward(
-    task: Task, params: BallbotParams, reference: Reference, c: np.ndarray, gains: Gains, start: float = 0.0
+    task: Task, params: Robot, reference: Reference, c: np.ndarray, gains: Gains, start: float = 0.0
 ) -> np.ndarray:
     """(n, 2) forces, N, to add along an open reference that is no motion of the robot, or not the cheapest near it.
 
@@ -134,7 +133,7 @@ def feedforward(
     a, b, _, r = _steps(task, params, x, u, c, start)
     of_x, of_u = cost_slopes(task, x, u, c, start + dt * np.arange(len(x)))
     missed = np.zeros_like(x)
-    missed[:-1] = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))[:-1] - x[1:]
+    missed[:-1] = params.step(x, u, dt, substeps_for(dt))[:-1] - x[1:]
     forces, slope = (
         np.zeros_like(u),
         np.zeros(x.shape[1]),
@@ -148,7 +147,7 @@ def feedforward(
     return forces
 
 
-def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray) -> np.ndarray:
+def tube_gains(task: Task, params: Robot, trajectory: Trajectory, c: np.ndarray) -> np.ndarray:
     """Feedback about an optimum of n steps, (n, 2, 8), N per unit of the state.
 
     The gains are TVLQR's. If the task ends in its goal, only those goal functions that limit the optimum are weighted at its

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from ballbot_baselines.solvers import guess
-from ballbot_gym import dynamics, omni, ops
+from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import substeps_for
 from ballbot_gym.tasks import Task
 
 _LEAN_BANDWIDTHS = (7.0, 10.0, 14.0)  # rad/s, of the lean's loop
@@ -44,7 +44,7 @@ class _Recovery:
     cost: float
     righted: int
 
-    def guesses(self, task: Task, params: BallbotParams, c: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    def guesses(self, task: Task, params: Any, c: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """At most one pair of states (n+1, 8) and forces (n, 2) to start from.
 
         It is this motion itself where that is a whole episode to the task's point of rest. Otherwise it is this motion until
@@ -61,7 +61,7 @@ class _Recovery:
 
 
 def righted(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, force: float, start: float = 0.0
+    task: Task, params: Any, x0: np.ndarray, c: np.ndarray, force: float, start: float = 0.0
 ) -> list[_Recovery]:
     """The cheapest member for each side of the fall that rights the robot without violating a margin, if there is one.
 
@@ -71,8 +71,7 @@ def righted(
     gains = np.array([(*loops, *a) for *loops, a in itertools.product(_LEAN_BANDWIDTHS, _TIME_CONSTANTS, aside)]).T
     target = task.reference(x0, c, params).x[-1, :2] if _has_point(task, x0, c, params) else np.array(x0[:2])
     with np.errstate(all="ignore"):  # members that fall may overflow, and are left out
-        if params.wheels is not None:
-            force = omni.LEAST_FORCE * force
+        force = params.FORCE_SHARE * force
         if params.grips:
             force = min(force, _GRIPPING * params.friction * params.weight)
         x, u = _simulated(task, params, x0, gains, target, force)
@@ -80,7 +79,7 @@ def righted(
         margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in task.margins(x, task.at(c, t))], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
         if params.grips:
-            limits = dynamics.limits(params, x[:-1], u, hold=task.control_dt)
+            limits = params.limits(x[:-1], u, hold=task.control_dt)
             gripping = np.logical_and.reduce([limit >= 0 for limit in limits])
             safe[1:] &= np.logical_and.accumulate(gripping, axis=0)
         costs = np.asarray(task.cost(x[:-1], u, task.at(c, t[:-1])))
@@ -99,7 +98,7 @@ def righted(
 
 
 def _simulated(
-    task: Task, params: BallbotParams, x0: np.ndarray, gains: np.ndarray, target: np.ndarray, force: float
+    task: Task, params: Any, x0: np.ndarray, gains: np.ndarray, target: np.ndarray, force: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """States (steps+1, n, 8) and forces (steps, n, 2), N, of n members that steer the ball to `target` (2,), m.
 
@@ -113,10 +112,9 @@ def _simulated(
     for k in range(task.steps):
         leaning = aside * np.exp(-k * dt / fade)
         u = np.stack(steering(params, tuple(x.T), leaning, bandwidth, seconds, target, force), -1)
-        if params.wheels is not None:
-            u = omni.wheel_forces(params, x, u).clip(-params.force_limit, params.force_limit)
+        u = params.turning_ball(x, u).clip(-params.force_limit, params.force_limit)
         forces.append(u)
-        x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
+        x = params.step(x, u, dt, substeps_for(dt))
         states.append(x)
     return np.array(states), np.array(forces)
 
@@ -131,7 +129,7 @@ def leaning_aside(x0: np.ndarray, lean: np.ndarray) -> np.ndarray:
 
 
 def steering(
-    params: BallbotParams,
+    params: Any,
     x: Vector,
     aside: Vector,
     bandwidth: Any,
@@ -151,7 +149,7 @@ def steering(
     """
     h, mass = params.first_moment, params.moving_mass
     inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
-    turning = mass * params.ball_radius if params.rolls else 0.0  # the torque that drives the ball turns the body too
+    turning = mass * params.drive_radius  # the torque that drives the ball turns the body too
     forces = []
     for axis in range(2):
         position, lean, speed, rate = x[axis] - target[axis], x[2 + axis], x[4 + axis], x[6 + axis]
@@ -164,6 +162,6 @@ def steering(
     return tuple(forces)
 
 
-def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> bool:
+def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: Any) -> bool:
     """Whether the task ends at a point of rest."""
     return not task.first_exit and len(task.reference(x0, c, params).x) == 1

@@ -2,16 +2,15 @@
 
 minimize   Σ_k cost(x_k, u_k, c)·control_dt        over forces u_k, |u_k| ≤ limit, held for control_dt
 subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n,
-           limits(x_k, u_k) ≥ 0 at both ends of each step, where the robot's friction is limited (`dynamics.limits`)
+           limits(x_k, u_k) ≥ 0 at both ends of each step, where the robot's friction is limited (`Ballbot.limits`)
 
 Solvers see actions, which are forces divided by their limit.
 """
 
 import math
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import lru_cache
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi
 import numpy as np
@@ -19,10 +18,8 @@ import numpy as np
 from ballbot_baselines.solvers import guess
 from ballbot_baselines.solvers.formulas import check_formulas
 from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
-from ballbot_gym import dynamics
-from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Kind, Robot, substeps_for
 from ballbot_gym.tasks import Task
 
 BARRIER = 0.1
@@ -34,7 +31,7 @@ FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
 
 _MOST_ITERATIONS = 200
-_checked: set[tuple[Task, "RobotKind"]] = set()
+_checked: set[tuple[Task, Kind]] = set()
 
 
 @dataclass(frozen=True)
@@ -70,71 +67,34 @@ class Backoff:
         return Backoff(**{name: min(value, max(share * value, least[name])) for name, value in asdict(self).items()})
 
 
-class RobotKind(NamedTuple):
-    """What differs between the formulas of robots. All else that differs are numbers, which are parameters of solvers."""
-
-    rolls: bool
-    grips: bool
-    wheels: bool
-
-    @classmethod
-    def of(cls, params: BallbotParams) -> "RobotKind":
-        return cls(params.rolls, params.grips, params.wheels is not None)
-
-    @property
-    def names(self) -> list[str]:
-        """Fields of such a robot, and of its wheels, that `robot_numbers` gives."""
-        names = ["total_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "force_limit"]
-        names += ["moving_mass", "ball_radius"] * self.rolls + ["friction"] * self.grips
-        return names + ["ball_inertia", *(field.name for field in fields(Wheels))] * self.wheels
-
-    @property
-    def states(self) -> int:
-        return 11 if self.wheels else 8
-
-    @property
-    def inputs(self) -> int:
-        return 3 if self.wheels else 2
-
-    def symbolic(self, p: casadi.SX) -> tuple[Any, casadi.SX]:
-        """A robot of this kind, whose numbers stand in p after the length of a step, and its force limit."""
-        found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(self.names)}
-        own = Wheels(*(found.pop(field.name) for field in fields(Wheels))) if self.wheels else None
-        weight = found["total_mass"] * found["gravity"]
-        default = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight}
-        return SimpleNamespace(**(default | found), rolls=self.rolls, grips=self.grips, wheels=own), found[
-            "force_limit"
-        ]
-
-
-def robot_numbers(params: BallbotParams) -> list[float]:
-    """What problems need to know of a robot, besides its kind."""
-    wheels = [] if params.wheels is None else [params.ball_inertia, *astuple(params.wheels)]
-    return [getattr(params, name) for name in RobotKind(params.rolls, params.grips, False).names] + wheels
-
-
-def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
+def kind_of(task: Task, params: Robot) -> tuple[Task, Kind]:
     """What problems are made for: a task, and a kind of robot.
 
     Raises:
         ValueError: no optimizer can use the task's formulas; see `check_formulas`.
     """
-    kind = task, RobotKind.of(params)
+    kind = task, params.kind
     if kind not in _checked:
         check_formulas(task, params)
         _checked.add(kind)
     return kind
 
 
+def symbolic(kind: Kind, p: casadi.SX) -> tuple[Any, casadi.SX]:
+    """A robot of a kind, whose numbers stand in p after the length of a step, and its force limit."""
+    model = kind.model(p[1 : 1 + len(kind.numbers)])
+    return model, model.force_limit
+
+
 @lru_cache(maxsize=64)
-def ocp_of(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
+def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
     """A task on its env's discretization, or with forces held longer than its control steps.
 
     Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, then the
     numbers of the robot. So problems on fine and coarse grids and of all robots of a kind share all compiled functions, and
     all tasks share those of the dynamics. With `free_time` one length of all intervals, s, is the last state.
     """
-    n, nc, first = kind.states, len(task.constant_names), 1 + len(kind.names)
+    n, nc, first = len(kind.robot.STATE), len(task.constant_names), 1 + len(kind.numbers)
     margin, goal, reserve = range(first + nc, first + nc + 3)  # back-offs in p
 
     def of_stage(s: casadi.SX, p: casadi.SX) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
@@ -149,8 +109,8 @@ def ocp_of(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
     def path(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not kind.grips:
             return margins(s, p)
-        robot, limit = kind.symbolic(p)
-        return casadi.vertcat(margins(s, p), *dynamics.limits(robot, s[:n], limit * a, p[reserve], p[0]))
+        robot, limit = symbolic(kind, p)
+        return casadi.vertcat(margins(s, p), *robot.limits(s[:n], limit * a, p[reserve], p[0]))
 
     def final(s: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not task.first_exit:
@@ -160,46 +120,46 @@ def ocp_of(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
         return casadi.vertcat(margins(s, p), (1 - p[goal]) ** 2 - 1 - casadi.vertcat(*task.goal(x, c)))
 
     def after(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, _), (robot, limit) = of_stage(s, p), kind.symbolic(p)
-        return casadi.vertcat(dynamics.step(robot, x, limit * a, length, substeps), s[n:])
+        (x, length, _), (robot, limit) = of_stage(s, p), symbolic(kind, p)
+        return casadi.vertcat(robot.step(x, limit * a, length, substeps), s[n:])
 
     def rates(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, _), (robot, limit) = of_stage(s, p), kind.symbolic(p)
-        return casadi.vertcat(length * dynamics.derivative(robot, x, limit * a), casadi.SX.zeros(int(free_time)))
+        (x, length, _), (robot, limit) = of_stage(s, p), symbolic(kind, p)
+        return casadi.vertcat(length * robot.derivative(x, limit * a), casadi.SX.zeros(int(free_time)))
 
     def cost(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, c), (_, limit) = of_stage(s, p), kind.symbolic(p)
+        (x, length, c), (_, limit) = of_stage(s, p), symbolic(kind, p)
         return task.cost(x, limit * a, c) * length
 
-    substeps = 2 if free_time else dynamics.substeps_for(task.control_dt)
+    substeps = 2 if free_time else substeps_for(task.control_dt)
     return Ocp(
         name=f"{task.id}-free-time" if free_time else task.id,
         states=n + free_time,
-        inputs=kind.inputs,
+        inputs=len(kind.robot.ACTION),
         params=first + nc + 2 + kind.grips + task.clock,
         counts_stages=task.clock,
         next=after,
         cost=cost,
         inequalities=path,
         final_inequalities=final,
-        rates=rates if kind.wheels else None,
+        rates=rates if kind.robot.LONG_EQUATIONS else None,
         rk4_steps=substeps,
     )
 
 
 def shooting_parameters(
-    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1, start: float = 0.0
+    task: Task, params: Robot, c: np.ndarray, backoff: Backoff, coarseness: int = 1, start: float = 0.0
 ) -> list[float]:
-    """p of `ocp_of`: s that forces are held, `robot_numbers`, c, back-offs from margins and goal, of grip if friction
+    """p of `ocp_of`: s that forces are held, `Robot.numbers`, c, back-offs from margins and goal, of grip if friction
     is limited, and the episode's time at the start, s, if the task has a clock.
     """
     reserve = [backoff.grip] if params.grips else []
-    numbers, clock = robot_numbers(params), [start] if task.clock else []
+    numbers, clock = params.numbers(), [start] if task.clock else []
     return [task.control_dt * coarseness, *numbers, *c, backoff.margin, backoff.goal, *reserve, *clock]
 
 
 @lru_cache(maxsize=256)
-def _solver(task: Task, kind: RobotKind, free_time: bool, *options: Any) -> OcpSolver:
+def _solver(task: Task, kind: Kind, free_time: bool, *options: Any) -> OcpSolver:
     return OcpSolver(ocp_of(task, kind, free_time), *options)
 
 
@@ -208,7 +168,7 @@ class Shooting:
     """One episode as a problem. Guesses are states x (n+1, 8) and actions a (n, 2), forces divided by their limit."""
 
     task: Task
-    params: BallbotParams
+    params: Robot
     x0: np.ndarray
     c: np.ndarray
     backoff: Backoff

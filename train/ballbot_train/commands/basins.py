@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table

@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import certified, files
-from ballbot_gym.randomization import checked_randomization
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER, checked_randomization
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, physics_or_default

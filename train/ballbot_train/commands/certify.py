@@ -9,8 +9,7 @@ from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import named_problem
-from ballbot_gym.randomization import checked_randomization
-from ballbot_gym.robots import PAPER, named_robot, robot_setting
+from ballbot_gym.robot import PAPER, checked_randomization, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs

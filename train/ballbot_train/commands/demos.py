@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ballbot_gym.robots import file_name
+from ballbot_gym.robot import file_name
 from ballbot_train.commands.options import UNNAMED, WorkersOption
 from ballbot_train.console import console
 from ballbot_train.executors import Workers

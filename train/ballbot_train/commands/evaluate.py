@@ -9,8 +9,7 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, file_name
+from ballbot_gym.robot import PAPER, Randomization, checked_randomization, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, file_name, named_robot
+from ballbot_gym.robot import PAPER, file_name, named_robot
 from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import FILTERED, policy_path, task_name
 from ballbot_train.names import file_part
@@ -34,7 +34,7 @@ def export(
         robot: name of the policy's robot.
         prefix: how the names in a C file begin; give each controller of one program another.
     """
-    filtered = policy.endswith(FILTERED) and format == "c" and named_robot(robot).wheels is not None
+    filtered = policy.endswith(FILTERED) and format == "c" and named_robot(robot).SENSORS
     name, policy = file_part(policy), policy.removesuffix(FILTERED) if filtered else policy
     task = task_name(policy, task, robot)
     problem = make_task(task, robot)

@@ -12,7 +12,7 @@ from typing import Literal
 import gymnasium
 
 from ballbot_gym import files
-from ballbot_gym.robots import check_name
+from ballbot_gym.robot import check_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import check_least, console, markdown, physics_or_default
 from ballbot_train.evaluation.evaluate import evaluate

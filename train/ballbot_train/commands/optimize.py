@@ -7,7 +7,7 @@ import numpy as np
 
 from ballbot_baselines import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import RobotName, check_least, check_names, console, print_table
 from ballbot_train.report import figures, labels

@@ -14,7 +14,7 @@ from ballbot_baselines.paper.problems import (
     track_plan,
 )
 from ballbot_gym.engines import PHYSICS_NAMES
-from ballbot_gym.params import default_params
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.console import check_names, console, physics_or_default, print_rows
 from ballbot_train.report import figures, labels

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from ballbot_gym.engines import default_physics
-from ballbot_gym.robots import PAPER, file_name
+from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.names import file_part

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default

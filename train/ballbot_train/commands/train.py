@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, cast
 
 from ballbot_gym import certified
-from ballbot_gym.randomization import checked_randomization
-from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
+from ballbot_gym.robot import PAPER, checked_randomization, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import UNNAMED
 from ballbot_train.console import RobotName, check_names, console, option, physics_or_default

@@ -7,7 +7,7 @@ that robot's own floor, on other floors too.
 from collections.abc import Callable
 from pathlib import Path
 
-from ballbot_gym.robots import PAPER, ROBOTS
+from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
@@ -85,7 +85,7 @@ def transfer(
             robot,
             made_for=own,
             friction=friction,
-            told={"made_for": own, "robot": robot, "friction": floor(robot, friction).friction},
+            told={"made_for": own, "robot": robot, "friction": getattr(floor(robot, friction), "friction", None)},
         )
         for own, by_task in chosen.items()
         for task, names in by_task.items()

@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from ballbot_gym.robots import PAPER, file_name
+from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.commands.train import Run, command_with

@@ -17,7 +17,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import portable

@@ -14,9 +14,7 @@ from ballbot_gym import certified, files
 from ballbot_gym.certified import version
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.identity import named_problem
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import PAPER, named_robot, robot_setting
+from ballbot_gym.robot import PAPER, Randomization, Robot, named_robot, robot_setting
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train import jobs
@@ -162,7 +160,7 @@ def publish(
     print_table(title, header, table)
 
 
-def floor(robot: str, friction: float | None) -> BallbotParams:
+def floor(robot: str, friction: float | None) -> Robot:
     """A robot by name on a floor with this friction; None is the robot's own.
 
     Raises:
@@ -171,9 +169,10 @@ def floor(robot: str, friction: float | None) -> BallbotParams:
     params = named_robot(robot)
     if friction is None:
         return params
-    if not params.rolls:
-        raise ValueError(f"the ball of {robot!r} does not roll, so its floor has no friction; give a rolling robot")
-    return replace(params, friction=friction)
+    try:
+        return params.on_floor(friction)
+    except ValueError as error:
+        raise ValueError(f"{robot!r}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,7 @@ class Group:
         return self.task, self.robot, self.randomization if self.own_optima else Randomization()
 
     @property
-    def believed(self) -> tuple[Task, BallbotParams]:
+    def believed(self) -> tuple[Task, Robot]:
         """What the controller is made for."""
         made_for = self.made_for or self.robot
         return make_task(self.task, made_for), named_robot(made_for)
@@ -227,9 +226,10 @@ def run_groups(
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         seed: of whatever is drawn: episode i draws the same in every group.
-        record: whether to write what the controllers do, for `ballbot submit`, which knows no robot with wheels.
+        record: whether to write what the controllers do, for `ballbot submit`, which supports no robot with
+            outputs, as wheels have.
     """
-    recorded = {group.robot: record and named_robot(group.robot).wheels is None for group in groups}
+    recorded = {group.robot: record and not named_robot(group.robot).OUTPUTS for group in groups}
     parts = [range(start, min(start + CHUNK, episodes)) for start in range(0, episodes, CHUNK)]
     # the optima go along, because workers on other machines do not have this user's cache
     known = {

@@ -4,8 +4,7 @@ from pathlib import Path
 from types import ModuleType
 
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot, robot_name
+from ballbot_gym.robot import PAPER, Robot, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train import policy_files
@@ -28,9 +27,9 @@ def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
     return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
-def filters(params: BallbotParams) -> tuple[str, ...]:
+def filters(params: Robot) -> tuple[str, ...]:
     """What may follow the names of controllers of a robot."""
-    return _experts().FILTERS if params.wheels is None else (FILTERED,)
+    return _experts().FILTERS if params.TRACK_FILTERS else (FILTERED,)
 
 
 def plain(name: str) -> str:
@@ -97,7 +96,7 @@ def made_for(name: str) -> str:
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
 
-def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> str:
+def policy_digest(name: str, task: Task, robot: str | Robot = PAPER) -> str:
     """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
     if is_expert(name):
         return ""
@@ -152,7 +151,7 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
     return Path(name)
 
 
-def portable(name: str, task: Task, params: BallbotParams) -> str | Controller:
+def portable(name: str, task: Task, params: Robot) -> str | Controller:
     """The controller of a file, to be sent to workers that do not have the file. Other names stay names.
 
     Raises: as `make_controller`.
@@ -160,7 +159,7 @@ def portable(name: str, task: Task, params: BallbotParams) -> str | Controller:
     return make_controller(name, task, params) if is_file(name) else name
 
 
-def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
+def make_controller(name: str, task: Task, params: Robot) -> Controller:
     """The controller that a name stands for. torch is imported only for a policy.
 
     Args:
@@ -173,7 +172,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    if name in _experts().VARIANTS and params.wheels is None:
+    if name in _experts().VARIANTS and params.TRACK_FILTERS:
         return _experts().VARIANTS[name](task, params)
     ending = _filter_of(name)
     controller = _unfiltered(name.removesuffix(ending), task, params)
@@ -186,7 +185,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     return FilteredController(task, params, ending, controller)
 
 
-def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
+def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
     if name in _experts().CONTROLLERS | _experts().VARIANTS:
         return (_experts().CONTROLLERS | _experts().VARIANTS)[name](task, params)
     robot = robot_name(params)

@@ -17,10 +17,8 @@ import numpy as np
 from ballbot_gym import certified, seeding
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.identity import problem_parts
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import name_of
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER, Randomization, Robot
 from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.console import late_bar
@@ -32,7 +30,7 @@ from ballbot_train.policy_files import PolicyError
 from ballbot_train.provenance import provenance
 
 
-def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
+def as_controller(policy: Any, task: Task, params: Robot) -> Controller:
     """Anything that acts, as a Controller.
 
     Args:
@@ -67,7 +65,7 @@ class Predictor:
     It keeps the recurrent state, and normalizes observations as in training.
     """
 
-    def __init__(self, model: Any, task: Task, params: BallbotParams):
+    def __init__(self, model: Any, task: Task, params: Robot):
         self._model, self._state, self.history = model, None, 0
         if hasattr(model, "observation_space"):
             from ballbot_train.saved_models import check_spaces, history_of  # it imports torch
@@ -100,7 +98,7 @@ def evaluate(
     physics: str | None = None,
     name: str | None = None,
     randomization: Randomization | str | None = None,
-    robot: str | BallbotParams = PAPER,
+    robot: str | Robot = PAPER,
     workers: int | Workers = 1,
     out: str | Path | None = None,
 ) -> Row:
@@ -118,7 +116,7 @@ def evaluate(
         name: of the row; default, the policy's own.
         randomization: what the policy is not told, or a name in `TRACKS`; default, nothing. The regret is over the optimum
             of each episode's own robot and delay, which a policy could only reach that knows them.
-        robot: a name in `ROBOTS`, or any BallbotParams.
+        robot: a name in `ROBOTS`, or any Robot.
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
@@ -144,7 +142,7 @@ def evaluate(
             results = run_episodes(env, controller, *named, indices, 0, known, motions, advance)
         row = summarize(results)
         if out is not None and held is not None:
-            ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
+            ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": env.params.record()}
             digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
             key, problem = f"{on}/{named[0]}", {on: problem_parts(env.task, env.params)}
             more = {
@@ -154,7 +152,7 @@ def evaluate(
             }
             results, facts = held.joined(Path(out), ran, more, results)
             write_leaderboard(leaderboard(results), results, provenance() | facts, Path(out))
-            if env.params.wheels is None and not env.randomization.active:
+            if not env.params.OUTPUTS and not env.randomization.active:
                 who = env.physics, named[0], digest
                 recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)
         return row

@@ -25,11 +25,10 @@ from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
 from ballbot_gym.rollout import Controller, PlanError
+from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import limit_names
 from ballbot_train.console import progress_bars
 from ballbot_train.evaluation.controllers import is_expert, make_controller
 from ballbot_train.evaluation.evaluate import Predictor

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import certified, dynamics
+from ballbot_gym import certified
 from ballbot_gym.engines import make_simulator
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Ballbot, Robot, substeps_for
+from ballbot_gym.step import limit_names, outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_train.evaluation import recordings
 
 TOLERANCE = 1e-6
@@ -54,7 +54,7 @@ class Steps:
 
 
 def judged(
-    steps: Steps, physics: str, task: Task, robot: BallbotParams, known: certified.EvaluationSet
+    steps: Steps, physics: str, task: Task, robot: Robot, known: certified.EvaluationSet
 ) -> tuple[list[float], list[str]]:
     """Cost and end of every episode of a recording that breaks no rule."""
     _check_starts(steps, known)
@@ -64,7 +64,7 @@ def judged(
         np.abs(steps.action).max(1) > 1, lambda i: f"the action {steps.action[i].tolist()} is beyond its limit of 1"
     )
     force = robot.force_limit * steps.action
-    simulated = robot.rolls and physics != "rk4"
+    simulated = robot.CONTACT and physics != "rk4"
     tolerance = CONTACT_TOLERANCE if simulated else TOLERANCE
     reached, slip = stepped(physics, robot, task, steps.before, force)
     error = steps.after - reached
@@ -72,7 +72,7 @@ def judged(
     steps.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated))
     steps.refuse(~(slip <= SLIP_TOLERANCE), lambda i: f"the ball slips at {slip[i]:.2g} m/s. {_SLIPS}")
     c = known.constants[steps.episode]
-    limits = dynamics.limits(robot, steps.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
+    limits = robot.limits(steps.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
     grip = (np.minimum.reduce(limits),) if limits else ()
     did = outcome(task, steps.before, force, steps.after, c, steps.step, grip)
     over = np.broadcast_to(did.terminated + did.truncated > 0, steps.step.shape)
@@ -101,7 +101,7 @@ def _check_starts(steps: Steps, known: certified.EvaluationSet) -> None:
 def _check_errors(
     steps: Steps,
     task: Task,
-    robot: BallbotParams,
+    robot: Robot,
     known: certified.EvaluationSet,
     error: np.ndarray,
     cost: np.ndarray,
@@ -122,18 +122,18 @@ def _check_errors(
 
 
 def stepped(
-    physics: str, robot: BallbotParams, task: Task, before: np.ndarray, force: np.ndarray
+    physics: str, robot: Robot, task: Task, before: np.ndarray, force: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The states (n, 8) one control step after others, and how fast a rolling ball then slips (n,), m/s."""
     dt, slip = task.control_dt, np.zeros(len(before))
     if physics == "rk4":
-        return dynamics.step(robot, before, force, dt, dynamics.substeps_for(dt)), slip
+        return robot.step(before, force, dt, substeps_for(dt)), slip
     simulator, reached = make_simulator(physics, robot, dt), np.empty_like(before)
     try:
         for i, (x, u) in enumerate(zip(before.tolist(), force.tolist(), strict=True)):
             simulator.reset(tuple(x))
             reached[i] = simulator.step(tuple(u))
-            if robot.rolls:
+            if robot.CONTACT:
                 slip[i] = math.hypot(*simulator.slip())
     finally:
         simulator.close()
@@ -143,7 +143,7 @@ def stepped(
 def _jump(missed: np.ndarray, tolerance: float, contact: bool) -> str:
     """What is wrong with a step whose end is missed by so much."""
     i = int(np.argmax(np.where(np.isfinite(missed), missed, np.inf)))
-    quantity, unit = dynamics.STATE[i]
+    quantity, unit = Ballbot.STATE[i]
     slips = f". {_SLIPS}" * contact
     missed_by = f"{quantity} is off by {missed[i]:.2g} {unit}, and {tolerance:g} is allowed"
     return f"the next state does not follow: {missed_by}{slips}"

@@ -12,10 +12,8 @@ from ballbot_gym import certified
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import name_of
-from ballbot_gym.robots import PAPER, checked_robot, file_name, robot_name
+from ballbot_gym.robot import PAPER, Randomization, Robot, checked_robot, file_name, robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.checks import check_methods, check_paths
@@ -32,7 +30,7 @@ _TASKS = 32  # at least, so that many workers have something to do
 
 def known(
     task: str | Task,
-    robot: str | BallbotParams = PAPER,
+    robot: str | Robot = PAPER,
     episodes: Iterable[int] | None = None,
     workers: int | Workers = 1,
     randomization: Randomization = Randomization(),
@@ -41,7 +39,7 @@ def known(
 
     Args:
         task: a name in `TASKS`, or any Task.
-        robot: a name in `ROBOTS`, or any BallbotParams.
+        robot: a name in `ROBOTS`, or any Robot.
         episodes: their indices; default, the first 200.
         workers: processes that compute, or `Workers`.
         randomization: what the robots and actuators of the episodes are drawn from.
@@ -65,7 +63,7 @@ def known(
 
 def compute(
     task: Task,
-    params: BallbotParams,
+    params: Robot,
     episodes: Iterable[int],
     workers: int | Workers = 1,
     randomization: Randomization = Randomization(),
@@ -128,7 +126,7 @@ def compute(
         )
 
 
-def _check_start(task: Task, params: BallbotParams, index: int) -> None:
+def _check_start(task: Task, params: Robot, index: int) -> None:
     """Raises a ValueError that names the method of a task with which an episode cannot even begin."""
     kind, where = type(task).__name__, f"at the start of episode {index}"
     x, c = cache.episode(task, params, index)

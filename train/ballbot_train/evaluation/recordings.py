@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import files
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import file_name, robot_name
+from ballbot_gym.robot import Robot, file_name, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.names import file_part
@@ -55,7 +54,7 @@ class Recording:
     actions: np.ndarray
 
 
-def of_episode(trajectory: Trajectory | None, params: BallbotParams) -> Recording:
+def of_episode(trajectory: Trajectory | None, params: Robot) -> Recording:
     """What was done in one episode; None is that no plan was found."""
     if trajectory is None:
         return Recording({}, np.zeros(1, np.int64), np.zeros((0, 8)), np.zeros((0, 2)))
@@ -67,7 +66,7 @@ def write_in(
     episodes: Sequence[Recording],
     task: Task,
     name: str,
-    robot: BallbotParams,
+    robot: Robot,
     physics: str,
     controller: str,
     policy: str = "",

@@ -21,8 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ballbot_gym.env import make_task
-from ballbot_gym.randomization import TRACKS, Randomization
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER, TRACKS, Randomization
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.benchmark import Group
 from ballbot_train.evaluation.results import Result, Row, leaderboard, shown

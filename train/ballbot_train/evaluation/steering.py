@@ -10,15 +10,13 @@ import numpy as np
 
 from ballbot_baselines.solvers.linearize import cost_slopes, discretize
 from ballbot_baselines.solvers.riccati import lqr_at_end, tracking_gains
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
 _H = 1e-5  # m, rad and per second, of finite differences
 
 
-def steered(
-    task: Task, robot: BallbotParams, x: np.ndarray, action: np.ndarray, c: np.ndarray, error: np.ndarray
-) -> float:
+def steered(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.ndarray, error: np.ndarray) -> float:
     """Bounds what errors changed in an episode's cost: the sum of |costate · error| over steps and components of the state.
 
     Args:
@@ -32,7 +30,7 @@ def steered(
     return float(np.abs(costates(task, robot, x, action, c) * error).sum())
 
 
-def costates(task: Task, robot: BallbotParams, x: np.ndarray, action: np.ndarray, c: np.ndarray) -> np.ndarray:
+def costates(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.ndarray) -> np.ndarray:
     """The slopes (n, 8) of an episode's cost with respect to the state after each step; arguments as of `steered`.
 
     After a deviation time-varying LQR steers back to the motion. Along an optimum the slopes do not depend on how one steers

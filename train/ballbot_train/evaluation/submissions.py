@@ -22,9 +22,9 @@ from ballbot_gym import certified, files
 from ballbot_gym.certified import version
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.robot import PAPER, ROBOTS, named_robot
+from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.tasks.transition import limit_names
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError, judged
 from ballbot_train.evaluation.results import Result, read_results, summarize, to_json
@@ -229,7 +229,7 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
     recording = recordings.read(path, content)
     facts = _checked_facts(recording.about, path)
     robot = named_robot(facts["robot"])
-    if robot.wheels is not None:
+    if robot.OUTPUTS:
         raise SubmissionError(
             f"{path}: {facts['robot']} has wheels, and recordings have no heading; the board has no such robots"
         )

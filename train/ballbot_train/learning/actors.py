@@ -6,8 +6,7 @@ from typing import Any, Literal
 import torch
 from torch.optim.swa_utils import AveragedModel
 
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot, registered_name
+from ballbot_gym.robot import PAPER, Robot, named_robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.fitting import start_as_lqr
@@ -42,7 +41,7 @@ def spec_for(
     Raises:
         ValueError: the task does not have the symmetry that the settings ask for.
     """
-    symmetry = "none" if named_robot(robot).wheels is not None else symmetry
+    symmetry = "none" if not named_robot(robot).SYMMETRIES else symmetry
     steady = task.fine_frame or task.frame
     frames = {
         "routes": task.routed_frame,
@@ -77,7 +76,7 @@ def spec_for(
 
 
 def actor_for(
-    task: Task, params: BallbotParams, config: Any, history: int, informed: bool, start: PolicyNetwork | None
+    task: Task, params: Robot, config: Any, history: int, informed: bool, start: PolicyNetwork | None
 ) -> PolicyNetwork:
     """A policy to train, of the config's symmetry and hidden layers, that starts as LQR; or `start` as `started` makes it."""
     spec = spec_for(task, config.symmetry, config.hidden, True, history, registered_name(params), informed)

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate

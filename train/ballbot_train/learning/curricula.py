@@ -26,7 +26,7 @@ import torch
 
 from ballbot_gym.batch import BallbotBatch, BatchStep
 from ballbot_gym.ops import Vector
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.console import console
@@ -67,7 +67,7 @@ class CurriculumBatch(BallbotBatch):
         self,
         task: Task,
         num_envs: int,
-        params: BallbotParams,
+        params: Robot,
         gamma: float = 1.0,
         full: Task | None = None,
         short_episodes: tuple[float, float] = (0.0, 0.6),
@@ -322,7 +322,7 @@ def widened(task: Task, factor: float) -> Task:
     return wide(**{field.name: getattr(task, field.name) for field in fields(task)})
 
 
-def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) -> torch.Tensor:
+def optimal_starts(task: Task, params: Robot, count: int, steps: int) -> torch.Tensor:
     """The states along the optima of `count` episodes drawn for training, before their ends and before control step `steps`.
 
     The optima leave the share `_RESERVE` of the goal's tolerances unused.

@@ -13,7 +13,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.checks import LARGEST
 from ballbot_gym.identity import problem_parts
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
+from ballbot_gym.robot import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train import shards
 from ballbot_train.console import option

@@ -8,7 +8,7 @@ dataset shows recoveries too.
 |---|---|
 | actions (T, 2) | the executed actions; the env, reset with the episode's seed, replays the episode from them |
 | infos/expert_action (T, 2) | the expert's actions in the visited states: the labels to imitate |
-| infos/state (T+1, 8) | states; order and units in `dynamics.STATE` |
+| infos/state (T+1, 8) | states; order and units in `Ballbot.STATE` |
 | an episode's metadata | seed, expert, physics, cost, success, failure and the following |
 
 `plans` counts the expert's plans, and `plans_failed` its searches that found none.
@@ -43,8 +43,7 @@ from ballbot_gym import seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.identity import digest, named_problem
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robot import PAPER, Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs, shards
@@ -104,7 +103,7 @@ class DemoConfig:
 class Expert:
     """A controller as a teacher: it gives its action in states of an episode that others control, and replans if told to."""
 
-    def __init__(self, name: str, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
+    def __init__(self, name: str, task: Task, params: Robot, backoff: Backoff = EXECUTED):
         """Args: name: as in `DemoConfig`; backoff: given to a controller whose constructor takes one."""
         controller: Any = controllers.make_controller(name, task, params)
         if "backoff" in inspect.signature(type(controller)).parameters:
@@ -167,7 +166,7 @@ def record(
         | array | shape | |
         |---|---|---|
         | observations | (T+1, no) float32 | |
-        | states | (T+1, 8) | order and units in `dynamics.STATE` |
+        | states | (T+1, 8) | order and units in `Ballbot.STATE` |
         | labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
         | actions | (T, 2) float32 | executed |
         | rewards | (T,) | |

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ballbot_baselines.feedback.lqr import equilibrium_gain
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
@@ -82,7 +82,7 @@ class Fit:
 _STATE = ("network", "_optimizer")
 
 
-def start_as_lqr(network: PolicyNetwork, task: Task, params: BallbotParams) -> None:
+def start_as_lqr(network: PolicyNetwork, task: Task, params: Robot) -> None:
     """Sets the network's linear part to LQR's gain, or to zero if the task does not end at rest in an equilibrium.
 
     Raises:

@@ -12,7 +12,7 @@ import torch
 
 from ballbot_baselines import find_optimum
 from ballbot_baselines.optimum import sides
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.console import console
@@ -28,7 +28,7 @@ _TOLERANCE = 0.004  # choices whose costs differ by less, relative to the episod
 def fit_routes(
     routes: Routes,
     task: Task,
-    params: BallbotParams,
+    params: Robot,
     seed: int,
 ) -> float:
     """Fits the network to the predicted costs of `EPISODES` slaloms drawn for training.
@@ -60,7 +60,7 @@ def fit_routes(
     return regret
 
 
-def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+def predicted_regrets(task: Task, params: Robot, seed: int, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """What every choice of farther sides costs more than the best one, relative to the cost of the episode.
 
     Returns:

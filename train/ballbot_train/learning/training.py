@@ -51,8 +51,7 @@ from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.identity import digest, problem_parts
-from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar

@@ -39,7 +39,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import named_problem
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robots import PAPER, named_robot, robot_setting
+from ballbot_gym.robot import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import executors, jobs
 from ballbot_train.console import progress_bars

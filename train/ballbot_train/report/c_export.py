@@ -16,10 +16,9 @@ import torch
 from ballbot_baselines.feedback import kalman
 from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.feedback.lqr import equilibrium_gain
-from ballbot_gym import dynamics, files, sensors
+from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, Robot, named_robot, sensors, substeps_for
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.console import printable
@@ -105,7 +104,7 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         networks=networks,
         observed=c_function(
             "observed",
-            lambda x, c, t: task.seen(tuple(casadi.vertsplit(x)), task.at(tuple(casadi.vertsplit(c)), t)),
+            lambda x, c, t: task.seen(tuple(casadi.vertsplit(x)), task.at(tuple(casadi.vertsplit(c)), t), params),
             {"x": params.state_size, "c": len(task.constant_names), "t": 1},
         ),
         acted=c_function("acted", policy_function(network), {"o": spec.seen}),
@@ -119,7 +118,7 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
     return str(source)
 
 
-def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:
+def _filter(task: Task, params: Robot) -> dict[str, Any]:
     """What the template needs of `kalman.SensorFilter`."""
     if task.constant_names:
         raise ValueError(
@@ -133,7 +132,7 @@ def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:
 
     start, deviations = kalman.expected_start(task, params, np.zeros(0))
     return {
-        "substeps": dynamics.substeps_for(task.control_dt),
+        "substeps": substeps_for(task.control_dt),
         "start": start,
         "start_variance": deviations**2,
         "model_variance": kalman.WHEELS_ERROR,

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from ballbot_gym import certified, dynamics
+from ballbot_gym import certified
 from ballbot_gym.drawing.viewer import Viewer
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robot import ROBOTS
+from ballbot_gym.robot import tilt as tilt_of
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.report import labels
@@ -230,7 +231,7 @@ class PlayPage:
 
     def _row(self, runner: Runner, color: str) -> dict[str, Any]:
         """A row of the page's table."""
-        tilt, peak = (f"{math.degrees(angle):.0f}°" for angle in (dynamics.tilt(runner.x), runner.peak))
+        tilt, peak = (f"{math.degrees(angle):.0f}°" for angle in (tilt_of(runner.x), runner.peak))
         end = failure_word(runner.violated)
         if runner.arrived and math.isfinite(self.playground.optimum_cost):
             end = f"regret {100 * (runner.cost / self.playground.optimum_cost - 1):.1f} %"

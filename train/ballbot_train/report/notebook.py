@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 
 from ballbot_gym import files
 from ballbot_gym.display import Moving
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import checked_robot
+from ballbot_gym.robot import Robot, checked_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import report_page
@@ -23,7 +22,7 @@ from ballbot_train.report.replay import Replay, Take, playable
 _HEIGHT = 520  # px of a replay below a cell
 
 
-def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | BallbotParams) -> Path | None:
+def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Robot) -> Path | None:
     """See `ballbot_gym.display.Moving.show`."""
     takes = tuple(replace(take, trajectory=playable(take.trajectory, take.label)) for take in _takes(shown, names))
     title = " and ".join(take.label for take in takes)

@@ -17,13 +17,12 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import LqrController
-from ballbot_gym import certified, drawing, dynamics, files
+from ballbot_gym import certified, drawing, files
 from ballbot_gym.drawing import page
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.randomization import TRACKS, Randomization
+from ballbot_gym.robot import TRACKS, Randomization, Robot, default_params, substeps_for
+from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import outcome
 from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy import PolicyNetwork, load_network
 from ballbot_train.policy_files import BEST, PolicyError, read_description, shipped_policies
@@ -155,7 +154,7 @@ def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
     }
 
 
-def _scenario_data(scenario: Scenario, episode: int | None, params: BallbotParams) -> dict[str, Any]:
+def _scenario_data(scenario: Scenario, episode: int | None, params: Robot) -> dict[str, Any]:
     task = make_task(scenario.task)
     state, constants, optimum, best = np.zeros(8), np.zeros(0), None, None
     if episode is not None:
@@ -187,21 +186,19 @@ def _scenario_data(scenario: Scenario, episode: int | None, params: BallbotParam
     }
 
 
-def _model_script(params: BallbotParams, networks: Mapping[str, PolicyNetwork]) -> str:
+def _model_script(params: Robot, networks: Mapping[str, PolicyNetwork]) -> str:
     """The functions `step` and `push`, of a robot with the factors `_UNKNOWN`, and `MODELS`: those of every shipped task."""
     dt = make_task("stabilize").control_dt
-    substeps = dynamics.substeps_for(dt)
+    substeps = substeps_for(dt)
 
-    def robot(factors: casadi.SX) -> BallbotParams:
+    def robot(factors: casadi.SX) -> Robot:
         given: dict[str, Any] = dict(zip(_UNKNOWN, casadi.vertsplit(factors), strict=True))
         return TRACKS["unknown"].robot(params, tuple(given.get(name, 1.0) for name in Randomization.DRAWN))
 
     parts = [
+        javascript_function("step", lambda x, u, r: robot(r).step(x, u, dt, substeps), {"x": 8, "u": 2, "robot": 3}),
         javascript_function(
-            "step", lambda x, u, r: dynamics.step(robot(r), x, u, dt, substeps), {"x": 8, "u": 2, "robot": 3}
-        ),
-        javascript_function(
-            "push", lambda x, impulse, r: dynamics.pushed(robot(r), x, impulse), {"x": 8, "impulse": 2, "robot": 3}
+            "push", lambda x, impulse, r: robot(r).pushed(x, impulse), {"x": 8, "impulse": 2, "robot": 3}
         ),
     ]
     models = []

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_gym import certified
-from ballbot_gym.drawing import Drawing, GroundPath, Robot
+from ballbot_gym.drawing import Drawing, Drawn, GroundPath
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robot import PAPER, Robot, default_params, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
@@ -60,7 +59,7 @@ class Replay:
     title: str
     takes: tuple[Take, ...]
     markers: tuple[Marker, ...] = ()
-    params: BallbotParams = field(default_factory=default_params)
+    params: Robot = field(default_factory=default_params)
 
     @property
     def duration(self) -> float:
@@ -75,7 +74,7 @@ class Replay:
             slips = np.flatnonzero((take.slip > LEAST_SLIP) & (driven.t[1:] <= t))
             skids = (GroundPath(driven.x[i : i + 2, :2], SKID) for i in slips)
         paths = GroundPath(driven_path(driven, t), take.color), *skids
-        return Drawing(self.params, (Robot(take.trajectory.state(t), take.color, u),), paths, self.markers)
+        return Drawing(self.params, (Drawn(take.trajectory.state(t), take.color, u),), paths, self.markers)
 
 
 def driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
@@ -109,6 +108,7 @@ def certified_replay(
         PlanError: a controller finds no plan, unless `skip_planless`.
     """
     problem, params = make_task(task, robot), named_robot(robot)
+    own_floor = getattr(params, "friction", None)
     if not 0 <= episode < certified.EPISODES:
         raise ValueError(f"episode must be 0 to {certified.EPISODES - 1}, not {episode}")
     episode_set = optima.known(problem, robot, [episode])
@@ -132,7 +132,7 @@ def certified_replay(
         note = f"fails at {run.trajectory.duration:.2f} s"
         if not run.failure:
             regret = round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0  # no −0.0
-            of = "" if friction in (None, params.friction) else f" to the optimum of friction {params.friction:g}"
+            of = "" if friction in (None, own_floor) else f" to the optimum of friction {own_floor:g}"
             note = f"regret {regret:.1f} %{of}"
         if slip.max() > LEAST_SLIP:
             note += f"; slips for {problem.control_dt * np.count_nonzero(slip > LEAST_SLIP):.2f} s"

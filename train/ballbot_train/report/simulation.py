@@ -12,13 +12,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ballbot_gym import certified, dynamics
-from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym import certified
+from ballbot_gym.drawing import GHOST_OPACITY, Drawing, Drawn, GroundPath
 from ballbot_gym.engines import State, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
-from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.robot import PAPER, ROBOTS, Randomization, checked_randomization, default_params, named_robot, tilt
 from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import check_names
@@ -107,7 +105,7 @@ class Runner:
         """Begins an episode in a state (n,) with constants (nc,). The seed is of all that is drawn in it."""
         self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
         self.states, self.forces = [tuple(start[0].tolist())], []
-        self.cost, self.peak, self.violated, self.arrived = 0.0, float(dynamics.tilt(self.x)), "", False
+        self.cost, self.peak, self.violated, self.arrived = 0.0, float(tilt(self.x)), "", False
 
     def move_to(self, env: BallbotEnv) -> None:
         """Goes on in another environment, in the middle of an episode."""
@@ -132,7 +130,7 @@ class Runner:
 
     def push(self, impulse: np.ndarray) -> None:
         """Pushes the body's centre of mass by an impulse (2,), N·s."""
-        pushed = dynamics.pushed(self.env.episode_params, self.x, tuple(impulse.tolist()))
+        pushed = self.env.episode_params.pushed(self.x, tuple(impulse.tolist()))
         self.states[-1] = tuple(map(float, pushed))
         self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
 
@@ -142,7 +140,7 @@ class Runner:
         self.states.append(tuple(info["state"].tolist()) if np.isfinite(info["state"]).all() else self.x)
         self.forces.append(tuple(info["force"].tolist()))
         self.cost += info["cost"]
-        self.peak = max(self.peak, float(dynamics.tilt(self.x)))
+        self.peak = max(self.peak, float(tilt(self.x)))
         self.violated = self.env.limit_names[info["violated"]] if info["failure"] else ""
         self.arrived = terminated and info["success"]
 
@@ -264,9 +262,9 @@ class Playground:
         for i, runner in reversed(list(enumerate(self.runners))):
             alpha = GHOST_OPACITY if i else 1.0
             force = np.array(runner.force) if runner is main and not main.violated else None
-            said = failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
+            said = failure_word(runner.violated) or f"{math.degrees(tilt(runner.x)):.0f}°"
             label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
-            robots.append(Robot(np.array(runner.x), colors[i], force, alpha, push, label))
+            robots.append(Drawn(np.array(runner.x), colors[i], force, alpha, push, label))
             trace = np.array(runner.states[:-_TRACE_STEPS:-_TRACE_EVERY])[:, :2]
             paths += [GroundPath(trace, colors[i])] * (len(trace) > 1)
         return Drawing(self.world.params, tuple(robots), tuple(paths), tuple(self.world.task.markers(self.start[1])))
@@ -282,7 +280,12 @@ class Playground:
             return
         dt = self.world.task.control_dt
         if self.episode == "rest" and self.elapsed == round(_FIRST_PUSH_AFTER / dt):
-            self.push(*(part * self.world.params.total_mass / default_params().total_mass for part in FIRST_PUSH))
+            self.push(
+                *(
+                    part * getattr(self.world.params, "total_mass", 1.0) / default_params().total_mass
+                    for part in FIRST_PUSH
+                )
+            )
         for runner in self.runners:
             if not runner.stands_still:
                 try:

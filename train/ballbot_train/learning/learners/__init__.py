@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 from ballbot_gym.checks import MOST_ENVS
 from ballbot_gym.lazy import load
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
-    from ballbot_gym.randomization import Randomization
+    from ballbot_gym.robot import Randomization
     from ballbot_train.learning.training import Learner
     from ballbot_train.policy import PolicyNetwork
 
@@ -65,7 +65,7 @@ class Algorithm:
     def make(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         settings: Any,
         seed: int,
         demos: str | Path | None = None,
@@ -99,7 +99,7 @@ class Algorithm:
                 f"cost and goal of {task.id} depend on the time, which {self.name} does not know; train ppo or sac, and "
                 "from such a policy shac with --horizon 0"
             )
-        if params.wheels is not None and self.name in ("ppo", "sac"):
+        if params.OUTPUTS and self.name in ("ppo", "sac"):
             raise ValueError(
                 f"{self.name} here knows no robot with wheels; train shac or dagger, or Stable-Baselines3 on the env itself"
             )

@@ -24,13 +24,10 @@ import torch
 
 from ballbot_baselines import Backoff, Optimum, find_optima, find_optimum
 from ballbot_baselines.feedback.trajopt import EXECUTED
-from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
-from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import sides_passed
-from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import registered_name
+from ballbot_gym.robot import Randomization, Robot, registered_name, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -138,7 +135,7 @@ class Dagger:
     def __init__(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         config: DaggerConfig,
         seed: int = 0,
         demos: str | Path | None = None,
@@ -227,7 +224,7 @@ class Dagger:
         self,
         batch: BallbotBatch,
         state: BatchState,
-        robots: Sequence[BallbotParams],
+        robots: Sequence[Robot],
         rng: np.random.Generator,
         before: tuple[_Optima, np.ndarray] | None = None,
     ) -> tuple[list[BatchState], np.ndarray, _Optima]:
@@ -290,12 +287,12 @@ class Dagger:
         near = (np.abs(change) < _SMALL * limits).all(1) & np.isfinite(distances.min(1))
         return np.clip((optima.forces[rows, at] + change) / limits, -1, 1), near
 
-    def _optima_of(self, robots: Sequence[BallbotParams], x: np.ndarray, c: np.ndarray) -> _Optima:
+    def _optima_of(self, robots: Sequence[Robot], x: np.ndarray, c: np.ndarray) -> _Optima:
         """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours."""
         found: list[Optimum | None] = []
         for robot, rows in itertools.groupby(range(len(robots)), robots.__getitem__):
             of = list(rows)
-            few: dict[str, int] = {} if robot.wheels is None else {"guesses": 1}  # each takes seconds
+            few: dict[str, int] = {"guesses": 1} if robot.LONG_EQUATIONS else {}  # each takes seconds
             found += find_optima(self._task, robot, x[of], c[of], self.config.backoff, **few)
         optima = _Optima.none(len(x), self._task.steps, x.shape[1], robots[0].action_size)
         for i, optimum in enumerate(found):
@@ -324,7 +321,7 @@ class Dagger:
         robot = batch.model(state.drawn.unbind(0))
         for age in range(len(commands), 0, -1):
             dt = self._task.control_dt
-            later = dynamics.step(robot, x, commands[age - 1].unbind(0), dt, dynamics.substeps_for(dt))
+            later = robot.step(x, commands[age - 1].unbind(0), dt, substeps_for(dt))
             x = tuple(torch.where(state.drawn[5] >= age, new, old) for new, old in zip(later, x, strict=True))
         return torch.stack(x, 1).double().numpy()
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from ballbot_gym.batch import BatchState
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_gym.vector import BallbotVectorEnv
@@ -98,7 +98,7 @@ class ModelFree(ABC):
     def __init__(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         config: ModelFreeConfig,
         demos: Demos | None,
         warm: bool,

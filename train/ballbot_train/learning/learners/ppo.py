@@ -17,8 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import registered_name
+from ballbot_gym.robot import Robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
@@ -208,7 +207,7 @@ class Ppo(ModelFree):
     def __init__(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         config: PpoConfig,
         seed: int = 0,
         demos: str | Path | None = None,

@@ -20,8 +20,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import registered_name
+from ballbot_gym.robot import Robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_train.learning.actors import spec_for, started
@@ -250,7 +249,7 @@ class Sac(ModelFree):
     def __init__(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         config: SacConfig,
         seed: int = 0,
         demos: str | Path | None = None,

@@ -25,10 +25,8 @@ from typing import Any, cast
 import torch
 
 from ballbot_baselines.feedback.lqr import equilibrium_gain
-from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -92,7 +90,7 @@ TUNED: dict[str, ShacConfig] = {
 
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training, whenever it comes. It has no gradient
-_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 10000.0  # as of the margins, for `dynamics.limits` of robots that can slip
+_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 10000.0  # as of the margins, for `Ballbot.limits` of robots that can slip
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 
 _WARMUP_ITERATIONS = 40  # of the critic alone, if training starts from a policy
@@ -118,7 +116,7 @@ class Critic(torch.nn.Module):
     Where the policy sees the task's frame, the critic does too.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, policy: PolicyNetwork, hidden: tuple[int, ...]):
+    def __init__(self, task: Task, params: Robot, policy: PolicyNetwork, hidden: tuple[int, ...]):
         super().__init__()
         self._shown = policy.shown
         past = policy.spec.seen - policy.spec.observations
@@ -155,7 +153,7 @@ class _ExactGradient:
     def __init__(
         self,
         task: Task,
-        params: BallbotParams,
+        params: Robot,
         config: ShacConfig,
         seed: int = 0,
         start: PolicyNetwork | None = None,
@@ -171,12 +169,12 @@ class _ExactGradient:
         self._optimizer = torch.optim.Adam(self._trained.parameters(), config.learning_rate, betas=self._BETAS)
         # no window ends an episode
         self.task = replace(task, duration=_ENDLESS * task.control_dt if config.horizon else config.episode_seconds)
-        wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
+        equations, long = params.LONG_EQUATIONS, config.iterations >= _COMPILE_FROM
         self._world: dict[str, Any] = {"params": params, "randomization": randomization, "history": history}
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=wheels and long, **self._world)
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=equations and long, **self._world)
         self._start = self._batch.reset(seed=spawned(seed))  # (B, no) first observations of the running episodes
         self._step = self._one_step
-        if long and not wheels:  # else the batch compiles its part
+        if long and not equations:  # else the batch compiles its part
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     @property
@@ -232,7 +230,7 @@ class _ExactGradient:
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - self._DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * dt * squared
-        limits = dynamics.limits(self._batch.model(state.drawn.unbind(0)), before, force, hold=dt)
+        limits = self._batch.model(state.drawn.unbind(0)).limits(before, force, hold=dt)
         shortfalls = [(_GRIP_CLEARANCE - limit).clamp(min=0) for limit in limits]
         shaped = shaped + sum(_GRIP_PENALTY * dt * shortfall**2 for shortfall in shortfalls)
         return observation, new, result, cost, shaped, torch.stack(task.goal(x, c))
@@ -247,7 +245,7 @@ class Shac(_ExactGradient):
     )
     _BETAS, _FINAL_LEARNING_RATE_FRACTION, _MAX_GRAD_NORM, _DEEP = (0.7, 0.95), 0.01, 1.0, 0.15
 
-    def __init__(self, task: Task, params: BallbotParams, config: ShacConfig, seed: int = 0, *given: Any, **world: Any):
+    def __init__(self, task: Task, params: Robot, config: ShacConfig, seed: int = 0, *given: Any, **world: Any):
         super().__init__(task, params, config, seed, *given, **world)
         self._random = torch.Generator().manual_seed(seed)
         self.critic = Critic(task, params, self._trained, config.hidden)
@@ -432,7 +430,7 @@ class WholeEpisodes(_ExactGradient):
 
 def make(
     task: Task,
-    params: BallbotParams,
+    params: Robot,
     config: ShacConfig,
     seed: int,
     demos: None = None,

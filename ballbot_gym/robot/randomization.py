@@ -11,7 +11,7 @@ from typing import Any
 from ballbot_gym import ops
 from ballbot_gym.checks import from_fields
 from ballbot_gym.ops import between, is_number
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot.base import Robot
 
 _LARGEST = 1e6  # of any number
 _LARGEST_FACTOR = 1e3
@@ -158,7 +158,7 @@ class Randomization:
 
     @property
     def noise(self) -> tuple[float, ...]:
-        """Standard deviation of each observed state component, in its unit; order as in `dynamics.STATE`."""
+        """Standard deviation of each observed state component, in its unit; order as in `Ballbot.STATE`."""
         groups = (self.position_noise, self.lean_noise, self.velocity_noise, self.lean_rate_noise)
         return tuple(std for std in groups for _ in range(2))
 
@@ -198,21 +198,11 @@ class Randomization:
         errors = (std * normal for std, normal in zip(deviations, normals(z[8:]), strict=True))
         return (*factors, gain, delay, between(z[6], *self.force), between(z[7], *self.friction), *errors)
 
-    def robot(self, params: BallbotParams, drawn: tuple[Any, ...]) -> BallbotParams:
+    def robot(self, params: Robot, drawn: tuple[Any, ...]) -> Robot:
         """The robot of an episode for which `draw` drew this."""
-        body_mass, ball_mass, com_height, inertia = drawn[:4]
+        names = ("body_mass", "ball_mass", "com_height", "inertia")
         force, friction = drawn[6:8] or (1.0, 1.0)
-        return replace(
-            params,
-            body_mass=params.body_mass * body_mass,
-            ball_mass=params.ball_mass * ball_mass,
-            com_height=params.com_height * com_height,
-            inertia=params.inertia * inertia,
-            axial_inertia=params.axial_inertia * inertia,
-            ball_inertia=params.ball_inertia * ball_mass if params.rolls else params.ball_inertia,
-            force_limit=params.force_limit * force,
-            friction=params.friction * friction if params.grips else params.friction,
-        )
+        return params.varied(**dict(zip(names, drawn[:4], strict=True)), force=force, friction=friction)
 
     def resting(self, none: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
         """What an actuator remembers that was asked for no force, none (2): the memory of `actuate`; () where it is ideal."""
@@ -273,11 +263,11 @@ def track_of(randomization: Randomization) -> str:
     return next((name for name, track in TRACKS.items() if track == randomization), "")
 
 
-def checked_randomization(randomization: Any, params: BallbotParams | None = None) -> Randomization:
+def checked_randomization(randomization: Any, params: Robot | None = None) -> Randomization:
     """The randomization that was given, also by its name in `TRACKS` or as the dict of all its fields, or none for None.
 
     Raises:
-        ValueError: no track of that name, or it pushes a robot with wheels, params.
+        ValueError: no track of that name, or it pushes a robot, params, whose action is no horizontal force.
         TypeError: it is something else, such as a dict of some fields.
     """
     if randomization is None:
@@ -291,8 +281,10 @@ def checked_randomization(randomization: Any, params: BallbotParams | None = Non
         raise TypeError(
             f"randomization must be a Randomization, for instance Randomization(lean_noise=0.01), not {randomization!r}"
         )
-    if params is not None and params.wheels is not None and randomization.pushes:
-        raise ValueError("pushes are forces Fx, Fy, which a robot with wheels does not have; leave out push_impulse")
+    if params is not None and randomization.pushes and not params.PUSHABLE:
+        raise ValueError(
+            f"pushes add to an action Fx, Fy, which {type(params).__name__} does not have; leave out push_impulse"
+        )
     return randomization
 
 

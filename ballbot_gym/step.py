@@ -6,10 +6,15 @@ these are the same everywhere.
 
 from typing import Any, NamedTuple
 
+import numpy as np
+from gymnasium import spaces
+
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks.base import Task
+
+_LARGEST_OBSERVED = 1e6  # far beyond what any episode shows
 
 GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
@@ -17,7 +22,7 @@ ENGINE = "engine"
 """The limit that is violated where an engine's simulation is unstable, so that no state follows."""
 
 
-def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
+def limit_names(task: Task, params: Robot) -> tuple[str, ...]:
     """What can end an episode of a robot: the task's limits, and its grip where friction is limited."""
     return (*task.limit_names, GRIP) if params.grips else task.limit_names
 
@@ -85,3 +90,32 @@ def first_violated(limits: tuple[Any, ...]) -> Any:
     for i in reversed(range(len(limits))):
         violated = ops.where(limits[i] >= 0, violated, float(i))
     return violated
+
+
+def check_observation(observation: Any, params: Robot, randomization: Randomization) -> str:
+    """What is observed, or a ValueError."""
+    if observation not in ("state", "sensors"):
+        raise ValueError(f"observation must be 'state' or 'sensors', not {observation!r}")
+    if observation == "sensors" and not params.SENSORS:
+        raise ValueError("only robots with wheels have sensors; give robot='omni' or observation='state'")
+    if observation == "sensors" and randomization.is_noisy:
+        raise ValueError("sensors have noise of their own; leave out that of the randomization")
+    return observation
+
+
+def observation_size(task: Task, params: Robot, observation: str) -> int:
+    """Numbers that are observed. Sensors show 9 readings, x and y where the episode began, m, and the task's constants."""
+    if observation == "state":
+        return task.observation_size(params)
+    return 11 + len(task.constant_names) + task.clock
+
+
+def observation_space(task: Task, params: Robot, history: int = 0, observation: str = "state") -> spaces.Box:
+    """What a robot can observe in a task, with a number of earlier observations and actions.
+
+    Past actions lie in [−1, 1]. So the bounds tell this space from a stack of frames that has the same size.
+    """
+    own = observation_size(task, params, observation)
+    past = np.append(np.full(own, _LARGEST_OBSERVED), np.ones(params.action_size))
+    high = np.append(np.full(own, _LARGEST_OBSERVED), np.tile(past, history)).astype(np.float32)
+    return spaces.Box(-high, high, dtype=np.float32)

@@ -3,28 +3,29 @@
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym.checks import from_fields
-from ballbot_gym.params import OMNI_URDF_PATH, ROLLING_URDF_PATH, URDF_FOLDER, URDF_PATH, BallbotParams
+from ballbot_gym.robot.base import Robot
+from ballbot_gym.robot.urdf import OMNI_URDF_PATH, ROLLING_URDF_PATH, URDF_FOLDER, URDF_PATH, read_urdf
 
 
 @dataclass(frozen=True)
-class Robot:
+class Registered:
     """A robot by name.
 
     `fields` are the fields of tasks, by the task's name, that differ from the defaults because the paper's episodes are
     beyond this robot.
     """
 
-    params: BallbotParams
+    params: Robot
     fields: Mapping[str, dict[str, float]]
 
 
-ROBOTS: dict[str, Robot] = {}
+ROBOTS: dict[str, Registered] = {}
 """Every robot by its name on the command line. `ballbot_gym.register_robot` fills it."""
 
 PAPER = "paper"
@@ -32,13 +33,13 @@ PAPER = "paper"
 
 
 def register_robot(
-    name: str, urdf: str | Path | BallbotParams, fields: Mapping[str, Mapping[str, float]] | None = None
+    name: str, urdf: str | Path | Robot, fields: Mapping[str, Mapping[str, float]] | None = None
 ) -> None:
     """Gives a robot a name, under which environments, experts and commands know it.
 
     Args:
         name: small letters, digits and underscores.
-        urdf: its file, with the chain of joints that `BallbotParams.from_urdf` describes; or its parameters.
+        urdf: its file, with the chain of joints that `read_urdf` describes; or its parameters.
         fields: fields of tasks, by the task's name, that differ from the defaults, where the usual episodes are beyond it:
             `{"stabilize": {"start_lean": 0.3}}`.
 
@@ -48,16 +49,16 @@ def register_robot(
         TypeError: urdf or fields are something else.
     """
     check_name(name, "robot")
-    if not isinstance(urdf, str | Path | BallbotParams):
-        raise TypeError(f"register_robot: urdf must be a path or a BallbotParams, not {urdf!r}")
+    if not isinstance(urdf, str | Path | Robot):
+        raise TypeError(f"register_robot: urdf must be a path or a Robot, not {urdf!r}")
     fields = {} if fields is None else fields
     if not isinstance(fields, Mapping) or not all(isinstance(each, Mapping) for each in fields.values()):
         raise TypeError(
             'register_robot: fields must be fields by task, such as {"stabilize": {"start_lean": 0.3}}, '
             f"not {fields!r}"
         )
-    params = urdf if isinstance(urdf, BallbotParams) else BallbotParams.from_urdf(urdf)
-    robot = Robot(params, {task: dict(own) for task, own in fields.items()})
+    params = urdf if isinstance(urdf, Robot) else read_urdf(urdf)
+    robot = Registered(params, {task: dict(own) for task, own in fields.items()})
     if ROBOTS.get(name, robot) != robot:
         raise ValueError(f"register_robot: the name {name!r} is taken by another robot; give yours another name")
     ROBOTS[name] = robot
@@ -93,7 +94,7 @@ def short_name(name: str) -> str:
     return short
 
 
-def named_robot(name: str) -> BallbotParams:
+def named_robot(name: str) -> Robot:
     """The robot of a name in `ROBOTS`, or of MODULE:NAME.
 
     Raises:
@@ -115,24 +116,38 @@ def robot_setting(robot: str) -> dict[str, str]:
     return {} if robot == PAPER else {"robot": robot}
 
 
-def robot_name(params: BallbotParams) -> str:
+def robot_name(params: Robot) -> str:
     """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
 
-    With another friction it is the same robot, unless that has a name of its own. Any other is taken for the paper's, or for
-    "rolling" if its ball rolls, or for "omni" if it has wheels. `registered_name` is for records, which must not mistake one.
+    With another friction it is the same robot, unless that has a name of its own. Any other is taken for the first that is
+    registered of its kind. `registered_name` is for records, which must not mistake one.
+
+    Raises:
+        ValueError: no robot of this kind is registered.
     """
     by_numbers = {robot.params: name for name, robot in reversed(ROBOTS.items())}
     if params in by_numbers:
         return by_numbers[params]
-    for name in ROBOTS:
-        if replace(named_robot(name), friction=params.friction) == params:
+    alike = [name for name, robot in ROBOTS.items() if type(robot.params) is type(params)]
+    for name in alike:
+        if named_robot(name).on_any_floor() == params.on_any_floor():
             return name
-    if params.wheels is not None:
-        return "omni"
-    return "rolling" if params.rolls else PAPER
+    return first_of_kind(params)
 
 
-def registered_name(params: BallbotParams) -> str:
+def first_of_kind(params: Robot) -> str:
+    """The name of the first robot that is registered of a robot's kind.
+
+    Raises:
+        ValueError: none is.
+    """
+    for name, robot in ROBOTS.items():
+        if type(robot.params) is type(params):
+            return name
+    raise ValueError(f"no {type(params).__name__} has a name; give it one with ballbot_gym.register_robot")
+
+
+def registered_name(params: Robot) -> str:
     """The name in `ROBOTS` of exactly this robot.
 
     Raises:
@@ -147,11 +162,11 @@ def registered_name(params: BallbotParams) -> str:
     return name
 
 
-def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
+def checked_robot(robot: Any, params: Any = None) -> Robot:
     """The robot that was given by name or by its parameters.
 
     Args:
-        robot: a name in `ROBOTS`, a BallbotParams, or the dict of all its fields that `dataclasses.asdict` makes.
+        robot: a name in `ROBOTS`, a Robot, or the dict of all its fields that `dataclasses.asdict` makes.
         params: the same without a name, or None; not both.
 
     Raises:
@@ -160,20 +175,21 @@ def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
     """
     if params is not None:
         if robot != PAPER:
-            raise ValueError("give either robot or params, not both: robot takes a name or a BallbotParams")
+            raise ValueError("give either robot or params, not both: robot takes a name or a Robot")
         robot = params
-    robot = from_fields(BallbotParams, robot)
+    for kind in dict.fromkeys(type(each.params) for each in ROBOTS.values()):
+        robot = from_fields(kind, robot)
     if params is None and isinstance(robot, str):
         return named_robot(robot)
-    if not isinstance(robot, BallbotParams):
+    if not isinstance(robot, Robot):
         raise TypeError(
-            "params must be a BallbotParams, for instance dataclasses.replace(default_params(), body_mass=12.0), "
+            "params must be a Robot, for instance dataclasses.replace(default_params(), body_mass=12.0), "
             f"not {robot!r}; robot may also be one of {', '.join(map(repr, ROBOTS))}"
         )
     return robot
 
 
-def own_fields(robot: str | BallbotParams, task: str) -> dict[str, float]:
+def own_fields(robot: str | Robot, task: str) -> dict[str, float]:
     """The fields of a task, by name, that a robot has other defaults of."""
     if isinstance(robot, str):
         named_robot(robot)  # raises if there is none

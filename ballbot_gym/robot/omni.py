@@ -3,7 +3,7 @@
 The wheels touch the ball at 45° of zenith angle and at azimuths α of 0, 120 and 240° about the body's axis. In the body's
 frame wheel i has the contact normal n_i = (s cos α, s sin α, c), and drives the ball along t_i = (−sin α, cos α, 0), with
 s = sin 45° and c = cos 45°; its rollers let the ball pass across. The state has three components more than that of
-`dynamics`: ψ, by which the body is turned about its own axis after γ and θ, ψ̇, and the ball's spin ω_z about the vertical.
+`ballbot`: ψ, by which the body is turned about its own axis after γ and θ, ψ̇, and the ball's spin ω_z about the vertical.
 
 The ball turns at ω = (−ẏ/r, ẋ/r, ω_z). Seen from the frame B of the leans, in which the body turns by ψ alone, it turns
 relative to the body at
@@ -26,33 +26,34 @@ the body sees it,
 
     Σ a_i f_i = Σ a_i u_i − d r² D w − m r² D ẇ,    ẇ = J v̇ + (J̇ v − ψ̇ e₃ × w).
 
-The other terms are those of `dynamics`, with the body's spin γ̇ sin θ + ψ̇ about its axis in place of γ̇ sin θ, the ball's
+The other terms are those of `point_ball`, with the body's spin γ̇ sin θ + ψ̇ about its axis in place of γ̇ sin θ, the ball's
 energy ½ I_b ω_z², and a torque of the floor against the ball's spin, which is smooth where dry friction jumps. All that makes
 six linear equations M v̇ = q. The body and D are the same about all axes across the body's, so that ψ matters to u alone.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, as_float, is_number
+from ballbot_gym.robot.ballbot import FloorForce
+from ballbot_gym.robot.base import Quantity
+from ballbot_gym.robot.rolling_ball import RollingBall
 
 _SIN = _COS = math.sqrt(0.5)  # of the zenith angle of the wheels' contacts
 _AZIMUTHS = tuple(math.radians(degrees) for degrees in (0, 120, 240))
 ACROSS, ALONG = 1.5 * _COS**2, 3 * _SIN**2
 """D, across and along the body's axis."""
-LEAST_FORCE = math.sqrt(3) * _COS
-"""What the wheels together give at standstill in any direction, as a share of the pull of one."""
 _SPIN_SPEED = 1.0  # rad/s: a slower spin meets friction in proportion to it
 
 
 @dataclass(frozen=True)
 class Wheels:
-    """Three omni-wheels and their motors. `BallbotParams.force_limit` is a motor's pull at standstill on the ball, N.
+    """Three omni-wheels and their motors. `Omni.force_limit` is a motor's pull at standstill on the ball, N.
 
     | field | meaning | unit |
     |---|---|---|
@@ -73,17 +74,17 @@ class Wheels:
     spin_friction: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = as_float(getattr(self, field.name))
-            object.__setattr__(self, field.name, value)
+        for each in fields(self):
+            value = as_float(getattr(self, each.name))
+            object.__setattr__(self, each.name, value)
             if isinstance(value, str | bool | None):
-                raise ValueError(f"Wheels: {field.name} must be a number, not {value!r}")
+                raise ValueError(f"Wheels: {each.name} must be a number, not {value!r}")
             if not is_number(value):
                 continue  # a symbol
-            positive = field.name in ("radius", "no_load_speed")
+            positive = each.name in ("radius", "no_load_speed")
             if not (0 < value < math.inf if positive else 0 <= value < math.inf):
                 raise ValueError(
-                    f"Wheels: {field.name} must be {'positive' if positive else 'at least 0'} and finite, not {value}"
+                    f"Wheels: {each.name} must be {'positive' if positive else 'at least 0'} and finite, not {value}"
                 )
 
     def drag(self, force_limit: Any) -> Any:
@@ -94,6 +95,135 @@ class Wheels:
     def mass(self) -> float:
         """m, kg: the inertia as felt at the wheel's surface."""
         return self.inertia / self.radius**2
+
+
+@dataclass(frozen=True)
+class Omni(RollingBall):
+    """A ballbot that three omni-wheels drive. Its fields are those of `RollingBall` and
+
+    | field | meaning |
+    |---|---|
+    | wheels | the wheels and their motors |
+
+    An action is the pull of each wheel at standstill, N, and force_limit the largest one.
+    """
+
+    wheels: Wheels = field(kw_only=True)
+
+    STATE = (*RollingBall.STATE, Quantity("ψ", "rad"), Quantity("ψ̇", "rad/s"), Quantity("ω_z", "rad/s"))
+    ACTION = (Quantity("u1", "N"), Quantity("u2", "N"), Quantity("u3", "N"))
+    OUTPUTS = (
+        Quantity("cos ψ", "1"),
+        Quantity("sin ψ", "1"),
+        Quantity("ψ̇", "rad/s"),
+        Quantity("ω_z", "rad/s"),
+    )
+    OUTPUT_SCALE = (1.0, 1.0, 5.0, 5.0)
+    OUTPUT_STATES = 3
+    PARTS: ClassVar[dict[str, type]] = {"wheels": Wheels}
+    SYMMETRIES = frozenset()
+    LONG_EQUATIONS = True
+    BATCHED_OPTIMA = False
+    PUSHABLE = False
+    SENSORS = True
+    TRACK_FILTERS = False
+    FORCE_SHARE = math.sqrt(3) * _COS  # of the three wheels together, at standstill
+
+    def __post_init__(self) -> None:
+        if isinstance(self.wheels, dict):  # as `dataclasses.asdict` makes it
+            object.__setattr__(self, "wheels", Wheels(**self.wheels))
+        super().__post_init__()
+
+    def check_number(self, name: str, value: Any) -> None:
+        if name != "wheels":
+            super().check_number(name, value)
+        elif not isinstance(value, Wheels):
+            raise ValueError(f"Omni: wheels must be Wheels, not {value!r}")
+
+    def ideal(self) -> RollingBall:
+        """The same robot with a torque in any direction in place of the wheels."""
+        return RollingBall(**{each.name: getattr(self, each.name) for each in fields(RollingBall)})
+
+    @property
+    def wheel_radius(self) -> Any:
+        return self.wheels.radius
+
+    def number_names(self) -> tuple[str, ...]:
+        return (*super().number_names(), "ball_inertia", *(f"wheels.{each.name}" for each in fields(Wheels)))
+
+    def derivative(self, x: Vector, u: Vector) -> Vector:
+        parts, found = ops.components(x), self.accelerations(x, u)
+        return ops.stack(parts[4:8] + found[:4] + parts[9:10] + found[4:], like=x)
+
+    def accelerations(self, x: Vector, u: Vector) -> tuple[Any, ...]:
+        """(ẍ, ÿ, γ̈, θ̈, ψ̈, ω̇_z) in m/s² and rad/s² for state x (..., 11) and the wheels' forces u (..., 3), N."""
+        return solved(*equations(self, x, u))
+
+    def floor_force(self, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> FloorForce:
+        """Whatever drives the robot, the floor's force moves the whole of it."""
+        _, _, gamma, theta, _, _, gamma_dot, theta_dot, *_ = ops.components(x)
+        ax, ay, gamma_ddot, theta_ddot, *_ = acceleration
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        rates2 = gamma_dot * gamma_dot + theta_dot * theta_dot
+        n_x_ddot = (
+            cos_g * cos_t * gamma_ddot
+            - sin_g * sin_t * theta_ddot
+            - sin_g * cos_t * rates2
+            - 2 * cos_g * sin_t * gamma_dot * theta_dot
+        )
+        n_y_ddot = cos_t * theta_ddot - sin_t * theta_dot * theta_dot
+        mass, h = self.total_mass, self.first_moment
+        return mass * ax + h * n_x_ddot, mass * ay + h * n_y_ddot, self.vertical_force(x, acceleration)
+
+    def energy(self, x: Vector) -> Any:
+        """Total mechanical energy, J, of ball, body, rotors and wheels in state x (..., 11)."""
+        _, _, gamma, theta, *_ = parts = ops.components(x)
+        speeds = (*parts[4:8], *parts[9:])
+        m = mass_matrix(self, x, relative_turning(self, x)[1])
+        kinetic = 0.5 * _dot([_dot(row, speeds) for row in m], speeds)
+        return kinetic + self.first_moment * self.gravity * ops.cos(gamma) * ops.cos(theta)
+
+    def pushed(self, x: Vector, impulse: Vector) -> Vector:
+        """The state (..., 11) just after a horizontal impulse (..., 2), N·s, on the body's centre of mass."""
+        px, py = ops.components(impulse)
+        *place, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
+        psi, psi_dot, spin = ops.components(x)[8:]
+        a, b, d = ops.cos(gamma) * ops.cos(theta), -ops.sin(gamma) * ops.sin(theta), ops.cos(theta)  # of n
+        height, columns = self.com_height, relative_turning(self, x)[1]
+        moved = [px, py, height * a * px, height * (b * px + d * py), 0.0 * px, 0.0 * px]
+        changes = solved(mass_matrix(self, x, columns), moved)
+        speeds = [v + change for v, change in zip((vx, vy, gamma_dot, theta_dot), changes, strict=False)]
+        return ops.stack((*place, gamma, theta, *speeds, psi, psi_dot + changes[4], spin + changes[5]), like=x)
+
+    def outputs(self, x: Vector) -> tuple[Any, ...]:
+        psi, psi_dot, spin = ops.components(x)[8:]
+        return ops.cos(psi), ops.sin(psi), psi_dot, spin
+
+    def extended(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, 8) and forces (m, 2), m ≤ n, N, of an ideal ball's motion as (n, 11) and (m, 3) of this robot.
+
+        It does not turn, and the wheels' forces are clipped.
+        """
+        x = np.column_stack([x, np.zeros((len(x), 3))])
+        return x, self.turning_ball(x[: len(u)], u).clip(-self.force_limit, self.force_limit)
+
+    def turning_ball(self, x: Vector, force: Vector) -> Vector:
+        """u (..., 3), N, that turns the ball as the force (..., 2), N, of a rolling robot without wheels: by r e_z × force.
+
+        It makes up for the motors' loss of torque at the present speeds, and is not clipped.
+        """
+        _, _, gamma, theta, *_, psi, _, _ = ops.components(x)
+        fx, fy = ops.components(force)
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        # in the frame of the leans, N
+        t1, t2, t3 = -cos_g * fy, sin_g * sin_t * fy + cos_t * fx, -sin_g * cos_t * fy + sin_t * fx
+        (w1, w2, w3), _ = relative_turning(self, x)
+        drag = self.ball_radius * self.wheels.drag(self.force_limit)
+        t1, t2, t3 = t1 + ACROSS * drag * w1, t2 + ACROSS * drag * w2, t3 + ALONG * drag * w3
+        cos, sin = ops.cos(psi), ops.sin(psi)
+        t1, t2 = cos * t1 + sin * t2, cos * t2 - sin * t1
+        parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
+        return ops.stack(tuple(parts), like=force)
 
 
 def torque(radius: float, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
@@ -110,30 +240,6 @@ def torque(radius: float, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
     return cos * t1 - sin * t2, sin * t1 + cos * t2, t3
 
 
-def wheel_forces(params: Any, x: Vector, force: Vector) -> Vector:
-    """u (..., 3), N, that turns the ball as the force (..., 2), N, of a rolling robot without wheels: by r e_z × force.
-
-    It makes up for the motors' loss of torque at the present speeds, and is not clipped.
-
-    Args:
-        params: the robot.
-        x: (..., 11) state.
-        force: (..., 2), N.
-    """
-    _, _, gamma, theta, *_, psi, _, _ = ops.components(x)
-    fx, fy = ops.components(force)
-    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    # in the frame of the leans, N
-    t1, t2, t3 = -cos_g * fy, sin_g * sin_t * fy + cos_t * fx, -sin_g * cos_t * fy + sin_t * fx
-    (w1, w2, w3), _ = relative_turning(params, x)
-    drag = params.ball_radius * params.wheels.drag(params.force_limit)
-    t1, t2, t3 = t1 + ACROSS * drag * w1, t2 + ACROSS * drag * w2, t3 + ALONG * drag * w3
-    cos, sin = ops.cos(psi), ops.sin(psi)
-    t1, t2 = cos * t1 + sin * t2, cos * t2 - sin * t1
-    parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
-    return ops.stack(tuple(parts), like=force)
-
-
 def torque_on_ball(params: Any, x: Vector, turning: tuple[Any, Any, Any], u: Vector) -> tuple[Any, ...]:
     """Σ a_i f_i in the world, N·m, of the wheels on a ball that turns in the world, rad/s, and may slip on the floor.
 
@@ -144,7 +250,7 @@ def torque_on_ball(params: Any, x: Vector, turning: tuple[Any, Any, Any], u: Vec
     axes = (cos_g, 0.0, -sin_g), (-sin_g * sin_t, cos_t, -cos_g * sin_t), (sin_g * cos_t, sin_t, cos_g * cos_t)
     own = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
     w = tuple(_dot(axis, turning) - body for axis, body in zip(axes, own, strict=True))
-    faster = accelerations(params, x, u)
+    faster = params.accelerations(x, u)
     rotors = params.ball_radius**2 * params.wheels.mass
     felt = [
         pull - share * rotors * _dot(row, faster)
@@ -156,17 +262,6 @@ def torque_on_ball(params: Any, x: Vector, turning: tuple[Any, Any, Any], u: Vec
         )
     ]
     return tuple(_dot(column, felt) for column in zip(*axes, strict=True))
-
-
-def with_wheels(params: Any, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States (n, 8) and forces (m, 2), m ≤ n, N, of the robot without wheels, as (n, 11) and (m, 3) of one with wheels.
-
-    It does not turn, and the wheels' forces are clipped. Without wheels both stay as they are.
-    """
-    if params.wheels is None:
-        return x, u
-    x = np.column_stack([x, np.zeros((len(x), 3))])
-    return x, wheel_forces(params, x[: len(u)], u).clip(-params.force_limit, params.force_limit)
 
 
 def relative_turning(params: Any, x: Vector) -> tuple[tuple[Any, Any, Any], tuple[tuple[Any, ...], ...]]:
@@ -269,19 +364,6 @@ def solved(m: list[list[Any]], q: list[Any]) -> tuple[Any, ...]:
     for i in reversed(range(n)):
         q[i] = (q[i] - _dot(m[i][i + 1 :], q[i + 1 :])) / m[i][i]
     return tuple(q)
-
-
-def accelerations(params: Any, x: Vector, u: Vector) -> tuple[Any, ...]:
-    """(ẍ, ÿ, γ̈, θ̈, ψ̈, ω̇_z) in m/s² and rad/s² for state x (..., 11) and the wheels' forces u (..., 3), N."""
-    return solved(*equations(params, x, u))
-
-
-def kinetic_energy(params: Any, x: Vector) -> Any:
-    """J, of state x (..., 11): of ball, body, rotors and wheels."""
-    parts = ops.components(x)
-    speeds = (*parts[4:8], *parts[9:])
-    m = mass_matrix(params, x, relative_turning(params, x)[1])
-    return 0.5 * _dot([_dot(row, speeds) for row in m], speeds)
 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:

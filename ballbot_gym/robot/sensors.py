@@ -12,14 +12,10 @@ because the goal of a task is a place. What its leans and speeds are it is not t
 import math
 from typing import Any
 
-import numpy as np
-from gymnasium import spaces
-
-from ballbot_gym import dynamics, omni, ops
+from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization, normals
-from ballbot_gym.tasks import Task
+from ballbot_gym.robot import omni
+from ballbot_gym.robot.randomization import normals
 
 GYROSCOPE_NOISE = 0.005  # rad/s, of a sample
 GYROSCOPE_BIAS = 0.005  # rad/s, drawn per episode
@@ -31,38 +27,8 @@ SCALE = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
 
 FIRST_DRAWS, DRAWS = 10, 6
 """Uniform numbers that `first` and `following` take."""
-_LARGEST = 1e6  # far beyond what any episode shows
 MEMORY = 17
 """Numbers that they give: the gyroscope's biases, what the encoders did not count yet, readings, and where it began."""
-
-
-def check_observation(observation: Any, params: BallbotParams, randomization: Randomization) -> str:
-    """What is observed, or a ValueError."""
-    if observation not in ("state", "sensors"):
-        raise ValueError(f"observation must be 'state' or 'sensors', not {observation!r}")
-    if observation == "sensors" and params.wheels is None:
-        raise ValueError("only robots with wheels have sensors; give robot='omni' or observation='state'")
-    if observation == "sensors" and randomization.is_noisy:
-        raise ValueError("sensors have noise of their own; leave out that of the randomization")
-    return observation
-
-
-def observation_size(task: Task, params: BallbotParams, observation: str) -> int:
-    """Numbers that are observed. Sensors show 9 readings, x and y where the episode began, m, and the task's constants."""
-    if observation == "state":
-        return task.observation_size(params)
-    return 11 + len(task.constant_names) + task.clock
-
-
-def observation_space(task: Task, params: BallbotParams, history: int = 0, observation: str = "state") -> spaces.Box:
-    """What a robot can observe in a task, with a number of earlier observations and actions.
-
-    Past actions lie in [−1, 1]. So the bounds tell this space from a stack of frames that has the same size.
-    """
-    own = observation_size(task, params, observation)
-    past = np.append(np.full(own, _LARGEST), np.ones(params.action_size))
-    high = np.append(np.full(own, _LARGEST), np.tile(past, history)).astype(np.float32)
-    return spaces.Box(-high, high, dtype=np.float32)
 
 
 def samples(dt: float) -> int:
@@ -73,7 +39,7 @@ def samples(dt: float) -> int:
 def ideal(params: Any, x: Vector, u: Vector) -> tuple[Any, ...]:
     """The body's turning (3), rad/s, its specific force (3), m/s², and the wheels' speeds (3), rad/s, in a state under u."""
     _, _, gamma, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, _ = ops.components(x)
-    ax, ay, gamma_ddot, theta_ddot, *_ = dynamics.accelerations(params, x, u)
+    ax, ay, gamma_ddot, theta_ddot, *_ = params.accelerations(x, u)
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
     rates2, product = gamma_dot * gamma_dot + theta_dot * theta_dot, gamma_dot * theta_dot
     height = params.com_height
@@ -97,7 +63,7 @@ def ideal(params: Any, x: Vector, u: Vector) -> tuple[Any, ...]:
 
 def mean(params: Any, before: tuple[Any, ...], u: tuple[Any, ...], x: tuple[Any, ...], dt: float) -> tuple[Any, ...]:
     """What perfect sensors read (9) over a control step of dt, s, from a state to x under u; of wheels the angle, rad."""
-    slopes = (dynamics.derivative(params, state, u) for state in (before, x))
+    slopes = (params.derivative(state, u) for state in (before, x))
     middle = tuple(
         [0.5 * (a + b) + dt / 8 * (slope - later) for a, b, slope, later in zip(before, x, *slopes, strict=True)]
     )
