@@ -20,9 +20,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import SnoptSolver
 
-from ballbot_baselines.collocation import Guess, Problem, hermite_simpson, solve
-from ballbot_baselines.ocp import OcpSolver
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS
+from ballbot_baselines.paper.collocation import Guess, Problem, hermite_simpson, solve
+from ballbot_baselines.paper.problems import PAPER_PROBLEMS
+from ballbot_baselines.solvers.ocp import OcpSolver
 from ballbot_gym import files
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
 from ballbot_gym.rollout import PlanError

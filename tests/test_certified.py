@@ -105,7 +105,7 @@ def test_stored_trajectories_are_feasible_and_cost_what_is_stored(task, evaluati
 def test_solving_again_from_another_guess_finds_nothing_cheaper(task, evaluation, params):
     """And the same, but for a slalom whose floor slips: its narrow passages have dearer local optima too."""
     pytest.importorskip("casadi")
-    from ballbot_baselines.optimum import find_optimum
+    from ballbot_baselines import find_optimum
 
     for i in (0, 4):
         path = evaluation.trajectories[i].x[:, :2]

@@ -128,7 +128,7 @@ def test_wilson_s_interval_is_not_empty_where_nothing_failed():
 
 def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(monkeypatch):
     optima = fresh.find_optima("stabilize", 2, 0, 1)
-    from ballbot_baselines import certification
+    from ballbot_baselines.optimum import certification
 
     monkeypatch.setattr(certification, "optimum_of", None)  # whoever calls it again fails
     again = fresh.find_optima("stabilize", 2, 0, 1)

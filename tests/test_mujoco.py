@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.robots import named_robot

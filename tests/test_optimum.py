@@ -8,10 +8,9 @@ pytest.importorskip("casadi")
 
 import casadi
 
-from ballbot_baselines import optimum as optimum_module
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.ocp import FEASIBLE, Ocp, OcpSolver
-from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
+from ballbot_baselines import Backoff, LqrController, find_optimum, plan_to_track
+from ballbot_baselines.optimum import find as optimum_module
+from ballbot_baselines.solvers.ocp import FEASIBLE, Ocp, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout

@@ -5,10 +5,10 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines import guess as guesses
-from ballbot_baselines import paper_problems
-from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, hermite_guess, state
+from ballbot_baselines.paper import problems
+from ballbot_baselines.paper.collocation import Guess, collocation_error, solve
+from ballbot_baselines.paper.problems import PAPER_PROBLEMS, between_states, hermite_guess, state
+from ballbot_baselines.solvers import guess as guesses
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
@@ -181,15 +181,15 @@ def test_guess_along_an_accelerating_path_is_the_motion_itself(params):
 def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
     pytest.importorskip("pybullet")
     plan = plan_of("stabilize-1")
-    executed, error = paper_problems.track_plan(plan, params)
+    executed, error = problems.track_plan(plan, params)
     assert error < 0.01  # measured: 1 mm
-    assert executed.duration == pytest.approx(plan.trajectory.duration, abs=paper_problems.TRACKING_DT)
+    assert executed.duration == pytest.approx(plan.trajectory.duration, abs=problems.TRACKING_DT)
 
 
 def test_lqr_and_trajectory_optimization_start_where_the_papers_problem_starts():
     pytest.importorskip("pybullet")
     entry = PAPER_PROBLEMS["stabilize-1"]
-    episodes = paper_problems.compare_stabilization(entry)
+    episodes = problems.compare_stabilization(entry)
     steps = {name: np.diff(episode.trajectory.t) for name, episode in episodes.items()}
     assert {name: round(1 / step.mean()) for name, step in steps.items()} == {"lqr": 1000, "trajopt": 50}
     for episode in episodes.values():

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr, equilibrium_gain
+from ballbot_baselines.feedback.lqr import equilibrium_gain
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import certified, dynamics, files, named_robot
 from ballbot_gym.engines import PHYSICS, installed_physics, make_simulator
 from ballbot_gym.env import make_task

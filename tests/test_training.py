@@ -14,7 +14,7 @@ import torch
 from builders import measured
 from resuming import goes_on_as_if_never_stopped, parameters
 
-from ballbot_baselines.optimum import Backoff
+from ballbot_baselines import Backoff
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import problem_parts
 from ballbot_gym.params import default_params

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines import certification
+from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import named_problem

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines.collocation import Plan
-from ballbot_baselines.paper_problems import (
+from ballbot_baselines.paper.collocation import Plan
+from ballbot_baselines.paper.problems import (
     PAPER_PROBLEMS,
     TRACKING_DT,
     PaperProblem,

@@ -8,8 +8,8 @@ limits that bind, such as the clearance of an obstacle, are not part of it: a mo
 
 import numpy as np
 
-from ballbot_baselines.linearize import cost_slopes, discretize
-from ballbot_baselines.lqr import lqr_at_end, tracking_gains
+from ballbot_baselines.solvers.linearize import cost_slopes, discretize
+from ballbot_baselines.solvers.riccati import lqr_at_end, tracking_gains
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 

@@ -37,9 +37,8 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 
-from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.optimum import Backoff
-from ballbot_baselines.trajopt import EXECUTED
+from ballbot_baselines import CONTROLLERS, Backoff
+from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task

@@ -13,9 +13,9 @@ import casadi
 import numpy as np
 import torch
 
-from ballbot_baselines import kalman
-from ballbot_baselines.adaptive import FilteredController
-from ballbot_baselines.lqr import equilibrium_gain
+from ballbot_baselines.feedback import kalman
+from ballbot_baselines.feedback.adaptive import FilteredController
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import dynamics, files, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ballbot_gym import dynamics, files
-from ballbot_gym.picture import picture
+from ballbot_gym.drawing.picture import picture
 from ballbot_train.report.replay import LEAST_SLIP, Replay
 
 Format = Literal["png", "mp4", "webp"]
