@@ -31,7 +31,7 @@ ACCEPTABLE = "Solved_To_Acceptable_Level"
 """The status of ipopt where it stopped early, at its acceptable tolerance."""
 
 
-def no_path(*arguments: casadi.SX) -> casadi.SX:
+def _no_path(*arguments: casadi.SX) -> casadi.SX:
     """No constraint."""
     return casadi.SX(0, 1)
 
@@ -48,15 +48,15 @@ class Ocp:
     """(s, w, p) -> (states,)."""
     cost: StageFunction
     """(s, w, p) -> scalar."""
-    equalities: StageFunction = no_path
+    equalities: StageFunction = _no_path
     """(s, w, p) -> (ne,), each 0."""
-    inequalities: StageFunction = no_path
+    inequalities: StageFunction = _no_path
     """(s, w, p) -> (ni,), each ≥ 0."""
     final_cost: FinalFunction = lambda s, p: casadi.SX(0)
     """(s, p) -> scalar."""
-    final_equalities: FinalFunction = no_path
+    final_equalities: FinalFunction = _no_path
     """(s, p) -> (me,), each 0."""
-    final_inequalities: FinalFunction = no_path
+    final_inequalities: FinalFunction = _no_path
     """(s, p) -> (mi,), each ≥ 0."""
     counts_stages: bool = False
     """Whether p of every function has one entry more, at its end: the stage's number k, and N at the end."""
