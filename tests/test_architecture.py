@@ -23,7 +23,7 @@ ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for 
 ROOMS = (
     "ballbot_gym",
     *("solvers", "optimum", "feedback", "paper", "ballbot_baselines"),
-    *("ground floor", "evaluation", "learning", "report", "play", "commands"),
+    *("ground floor", "evaluation", "learning", "report", "commands"),
 )
 
 
@@ -90,17 +90,17 @@ def test_imports_go_down():
     assert {room_of(path) for path in FILES} == set(ROOMS)
 
 
-def test_only_the_engines_and_the_viewer_know_physics_engines_and_viser():
-    knowing = [path for path in FILES if imports(path) & {"pybullet", "mujoco", "viser"}]
+def test_only_the_engines_know_physics_engines_and_only_the_viewer_the_library_of_its_page():
+    knowing = [path for path in FILES if imports(path) & {"pybullet", "mujoco", "websockets"}]
     assert relative(knowing) == [
+        "ballbot_gym/drawing/viewer.py",
         "ballbot_gym/engines/bullet_client.py",
         "ballbot_gym/engines/mujoco.py",
-        "ballbot_gym/viewer.py",
     ]
 
 
 def test_environments_import_no_solver_and_no_learner_at_their_top():
-    heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "mujoco", "scipy", "matplotlib", "viser"}
+    heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "mujoco", "scipy", "matplotlib", "websockets"}
     # these are written in torch and CasADi, and imported when first used
     batched = {
         "autoreset.py",

@@ -16,7 +16,7 @@ def run(code, *blocked):
 
 
 MISSING = [  # in an order in which nothing imports what is missing later
-    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
+    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0', compile=True)", "torch", "train"),
     (
         "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
         *("scipy", "baselines"),
@@ -25,7 +25,7 @@ MISSING = [  # in an order in which nothing imports what is missing later
         "from ballbot_gym.trajectory import Trajectory; Trajectory([0, 1], [[0] * 8] * 2, [[0, 0]]).plot()",
         *("matplotlib", "train"),
     ),
-    ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
+    ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "websockets", "play"),
     (
         "from ballbot_train.executors import Workers, completed; list(completed([(0, int, ())], Workers(ray='local')))",
         *("ray", "ray"),
@@ -120,5 +120,5 @@ for task in ballbot_gym.TASKS.values():
     check_env(env.unwrapped)
     env.close()
 """
-    wrote = run(code, "pybullet", "viser")
+    wrote = run(code, "pybullet", "websockets")
     assert wrote.splitlines() == 4 * ["mujoco (480, 640, 3)"]

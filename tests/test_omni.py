@@ -20,7 +20,6 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.play.simulation import World
 from ballbot_train.policy import PolicyController, PolicyNetwork
 from ballbot_train.policy_files import PolicySpec
 
@@ -308,5 +307,3 @@ def test_what_knows_no_wheels_says_so(robot):
         PolicySpec.of(task, robot="omni", frame="orbit")
     with pytest.raises(ValueError, match="sac here knows no robot with wheels"):
         LEARNERS["sac"].make(task, robot, LEARNERS["sac"].settings("stabilize"), 0)
-    with pytest.raises(ValueError, match="the playground knows no robot with wheels"):
-        World("stabilize", "omni")

@@ -1,6 +1,7 @@
 """The robot in MuJoCo, as a chain of joints, and with contact where the ball rolls."""
 
 import math
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -292,7 +293,13 @@ def import_mujoco() -> ModuleType:
     """MuJoCo, or an ImportError that says how to get it."""
     with imports_of('physics="mujoco"', "mujoco"):
         import mujoco
+    if mujoco.get_mju_user_warning() is None:  # by default a warning also goes to MUJOCO_LOG.TXT in the current folder
+        mujoco.set_mju_user_warning(_print_warning)
     return mujoco
+
+
+def _print_warning(text: str) -> None:
+    print(f"MuJoCo: {text}", file=sys.stderr)
 
 
 def _inertial(mass: float, *inertia: float) -> dict[str, Any]:

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from ballbot_train.learning.rsl import RslVecEnv
     from ballbot_train.learning.sb3 import BallbotVecEnv
     from ballbot_train.onnx_export import export_onnx
-    from ballbot_train.play.simulation import Playground
     from ballbot_train.policy import load_policy
     from ballbot_train.policy_files import shipped_policies
     from ballbot_train.report.replay import certified_replay
+    from ballbot_train.report.simulation import Playground
 
 __all__ = [
     "BallbotVecEnv",
@@ -44,7 +44,7 @@ __all__ = [
 
 _MODULES = {
     "BallbotVecEnv": "learning.sb3",
-    "Playground": "play.simulation",
+    "Playground": "report.simulation",
     "RegretCallback": "learning.callbacks",
     "RslVecEnv": "learning.rsl",
     "certified_replay": "report.replay",

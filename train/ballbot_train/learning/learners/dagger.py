@@ -30,7 +30,7 @@ from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import sides_passed
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import robot_name
+from ballbot_gym.robots import registered_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -147,7 +147,7 @@ class Dagger:
         history: int = 0,
     ):
         """As of `Algorithm.make`. Demonstrations are its first samples."""
-        on_track, robot = randomization is not None or history > 0, robot_name(params)
+        on_track, robot = randomization is not None or history > 0, registered_name(params)
         samples = _first_samples(demos, task, robot, config, on_track)
         self.config, self.iteration, self._warm = config, 0, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations

@@ -21,6 +21,8 @@ FORCE = "#d91a8c"
 """Colour of the force's arrow."""
 PUSH = "#1a9e5c"
 """Colour of a push's arrow."""
+GOAL = "#1f6fb2"
+"""Colour of the arrow to the goal of a drive."""
 GHOST_OPACITY = 0.4
 FORCE_SCALE = 1 / 400
 """Length of the force's arrow, m/N."""
@@ -84,7 +86,7 @@ class Drawing:
 
 
 class Pose(NamedTuple):
-    """Where a ballbot's parts are, m. The body is an upright cylinder about `body`, turned by `turn`."""
+    """Where a ballbot's parts are, m. The body is a cylinder about the axis from `body` to `top`."""
 
     ball: np.ndarray
     """(3,) centre of the ball."""
@@ -92,8 +94,6 @@ class Pose(NamedTuple):
     """(3,) centre of the body."""
     top: np.ndarray
     """(3,) upper end of the body."""
-    turn: np.ndarray
-    """(4,) the body's rotation as a unit quaternion w, x, y, z."""
 
 
 def pose(params: BallbotParams, x: np.ndarray) -> Pose:
@@ -101,14 +101,14 @@ def pose(params: BallbotParams, x: np.ndarray) -> Pose:
     ball = np.array([x[0], x[1], params.ball_radius])
     gamma, theta = x[2], x[3]
     axis = np.array([math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)])
-    cos_g, sin_g, cos_t, sin_t = math.cos(gamma / 2), math.sin(gamma / 2), math.cos(theta / 2), math.sin(theta / 2)
-    turn = np.array([cos_g * cos_t, -cos_g * sin_t, sin_g * cos_t, sin_g * sin_t])  # about y, times about −x
     body = ball + params.com_height * axis
-    return Pose(ball, body, body + params.body_length / 2 * axis, turn)
+    return Pose(ball, body, body + params.body_length / 2 * axis)
 
 
 def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
     """Colour, and start and end (3,), m, of the arrows of a robot's force and push, where there is one to draw.
+
+    The forces of three wheels have no one direction, and get none.
 
     The force's starts at the ball's centre, and the push's at the body's centre of mass, as of `pose`.
     """
@@ -116,7 +116,7 @@ def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.nd
     return [
         (color, (at, at + scale * np.array([*part, 0.0])))
         for color, part, scale, least, at in drawn
-        if part is not None and math.hypot(*part) > least
+        if part is not None and len(part) == 2 and math.hypot(*part) > least
     ]
 
 

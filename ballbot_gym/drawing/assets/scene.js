@@ -1,5 +1,5 @@
 // Draws ballbots with WebGL 2: a floor, robots and translucent ghosts with shadows, markers, paths and arrows. What it draws is
-// described as in drawing.py. No library: the ones that draw in 3D are larger than all the rest of the page.
+// described as in ballbot_gym.drawing. No library: the ones that draw in 3D are larger than all the rest of the page.
 "use strict";
 
 const FIELD_OF_VIEW = 0.7; // rad, vertical
@@ -99,8 +99,9 @@ const Mesh = {
   },
 };
 
-/** A colour "#rrggbb", lighter in the dark, as in the pages' styles. */
+/** A colour "#rrggbb", lighter in the dark, as in the pages' styles; one of a marker's, in shares, stays. */
 function rgb(color) {
+  if (typeof color !== "string") return color.slice(0, 3);
   const parts = [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
   return NIGHT.matches ? parts.map((part) => 0.35 + 0.65 * part) : parts;
 }
@@ -225,7 +226,7 @@ class Scene {
     return t > 0 && t * FARTHEST < 60 ? Vector.plus(this.eye, ray, t) : null;
   }
 
-  /** A drawing: robots {x, color, u, alpha, push}, ghosts first, paths {points, color, dashed} and markers. */
+  /** A drawing: robots {x, yaw, color, u, alpha, push, goal}, ghosts first, paths {points, color, dashed} and markers. */
   draw({ robots, paths, markers }) {
     const { gl, at } = this;
     this.aim();
@@ -271,15 +272,40 @@ class Scene {
     this.put(this.cylinder, upright(radius, height, position), color);
   }
 
-  drawRobot({ x, color, u, alpha, push }) {
-    const { ball_radius, body_radius, body_length } = this.look.robot;
-    const { ball, low, body, axes } = pose(this.look.robot, x);
-    this.put(this.sphere, upright(ball_radius, ball_radius, x, ball_radius), [...rgb(this.look.colors.ball), alpha]);
-    const sides = [body_radius, body_radius, body_length].map((size, i) => Vector.times(axes[i], size));
+  drawRobot({ x, yaw = 0, color, u, alpha, push, goal }) {
+    const { robot, colors, least_force, force_scale, push_scale } = this.look;
+    const { ball, low, body, axes } = pose(robot, x);
+    this.put(this.sphere, upright(robot.ball_radius, robot.ball_radius, x, robot.ball_radius), [...rgb(colors.ball), alpha]);
+    const sides = [robot.body_radius, robot.body_radius, robot.body_length].map((size, i) => Vector.times(axes[i], size));
     this.put(this.cylinder, framed(...sides, low), [...rgb(color), alpha]);
+    if (robot.wheel_radius) this.drawWheels(ball, axes, yaw, [...rgb(colors.ball), alpha]);
     if (this.isShadow) return;
-    if (u && Math.hypot(...u) > this.look.least_force) this.drawArrow(ball, Vector.times([...u, 0], this.look.force_scale), this.look.colors.force, alpha);
-    if (push) this.drawArrow(body, [...push, 0], this.look.colors.push, alpha);
+    if (u?.length === 2 && Math.hypot(...u) > least_force) this.drawArrow(ball, Vector.times([...u, 0], force_scale), colors.force, alpha);
+    if (push) this.drawArrow(body, Vector.times([...push, 0], push_scale), colors.push, alpha);
+    if (goal) this.drawGoal(x, goal, colors.goal);
+  }
+
+  /** Three wheels that touch the ball at 45° of zenith angle, 120° apart about the body's axis; see omni.py. */
+  drawWheels(ball, [east, north, up], yaw, color) {
+    const { ball_radius, wheel_radius } = this.look.robot;
+    for (const azimuth of [0, 1, 2].map((i) => yaw + (2 * Math.PI * i) / 3)) {
+      const out = Vector.plus(Vector.times(east, Math.cos(azimuth)), north, Math.sin(azimuth));
+      const along = Vector.plus(Vector.times(east, -Math.sin(azimuth)), north, Math.cos(azimuth));
+      const normal = Vector.times(Vector.plus(out, up), Math.SQRT1_2);
+      const axle = Vector.times(Vector.cross(normal, along), 0.6 * wheel_radius);
+      const middle = Vector.plus(ball, normal, ball_radius + wheel_radius);
+      const [across, ahead] = [normal, along].map((side) => Vector.times(side, wheel_radius));
+      this.put(this.cylinder, framed(across, ahead, axle, Vector.plus(middle, axle, -0.5)), color);
+    }
+  }
+
+  /** An arrow on the floor, from beside a robot towards a point that is not close to it. */
+  drawGoal([x, y], goal, color) {
+    const way = [goal[0] - x, goal[1] - y, 0];
+    const distance = Math.hypot(...way);
+    if (distance < 0.6) return;
+    const unit = Vector.times(way, 1 / distance);
+    this.drawArrow(Vector.plus([x, y, 0.03], unit, 0.25), Vector.times(unit, Math.min(0.7, distance - 0.4)), color, 1);
   }
 
   /** An arrow from a point along a level vector, m. */
@@ -301,7 +327,7 @@ class Scene {
     if (!ring) return this.put(this.cylinder, upright(radius, 0.004, position), color, PLAIN);
     const angles = Array.from({ length: 181 }, (_, i) => (Math.PI * i) / 90);
     const points = angles.map((a) => Vector.plus(position, [Math.cos(a), Math.sin(a)], radius));
-    this.drawBand(points, color.slice(0, 3), 0.16);
+    this.drawBand(points, rgb(color), 0.16);
   }
 
   drawBand(points, color, dash) {
