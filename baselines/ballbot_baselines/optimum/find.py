@@ -90,15 +90,10 @@ def find_optimum(
         )
     t = start + task.control_dt * np.arange(len(best.states))
     trajectory = Trajectory(t, best.states, params.force_limit * best.inputs)
-    return Optimum(
-        cost=best.cost,
-        trajectory=trajectory,
-        status="optimal" if best.is_optimal else "feasible",
-        solver_status=best.status,
-        violation=best.violation,
-        iterations=best.iterations,
-        solver=best.solver,
-        seconds=time.perf_counter() - started,
+    return Optimum.of(
+        best,
+        trajectory,
+        time.perf_counter() - started,
         slopes=best.slopes,
         markers=tuple(task.markers(c)),
         feedback=partial(tube_gains, task, params, trajectory, c),

@@ -157,17 +157,8 @@ def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
 def _optimum(params: BallbotParams, result: Solution, seconds: float) -> Optimum:
     x, u = result.states[:, _X], params.force_limit * result.states[:, _A]
     t = result.states[0, _H] * np.arange(len(x))
-    return Optimum(
-        cost=result.cost,
-        trajectory=Trajectory(t, x, u, xdot=dynamics.derivative(params, x, u)),
-        status="optimal" if result.is_optimal else "feasible",
-        solver_status=result.status,
-        violation=result.violation,
-        iterations=result.iterations,
-        solver=result.solver,
-        seconds=seconds,
-        slopes=np.full(x.shape, np.nan),
-    )
+    trajectory = Trajectory(t, x, u, xdot=dynamics.derivative(params, x, u))
+    return Optimum.of(result, trajectory, seconds, slopes=np.full(x.shape, np.nan))
 
 
 def collocation_error(params: BallbotParams, trajectory: Trajectory) -> float:
