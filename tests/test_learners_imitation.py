@@ -137,7 +137,7 @@ def test_optima_are_found_one_by_one_where_they_cannot_be_found_at_once(monkeypa
     task, params, config = make_task("stabilize"), default_params(), replace(TINY_DAGGER, episodes_per_iteration=2)
     at_once, alone = dagger.Dagger(task, params, config), dagger.Dagger(task, params, config)
     at_once.iterate()
-    monkeypatch.setattr(batched, "solves", lambda task, params: False)
+    monkeypatch.setattr(batched, "_solves", lambda task, params: False)
     alone.iterate()
     first, second = (each.state_dict()["samples"][1].numpy() for each in (at_once, alone))
     np.testing.assert_allclose(second[:20], first[:20], atol=0.02)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines.solvers.riccati import closed_gains, discrete_lqr, feedforward, lqr_at_end, tracking_gains
+from ballbot_baselines.solvers.riccati import discrete_lqr, reference_gains
 from ballbot_gym import omni
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
@@ -42,7 +42,7 @@ class LqrController:
 
     About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
     gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one,
-    with forces that look ahead, because it may be no motion of the robot (`feedforward`).
+    with forces that look ahead, because it may be no motion of the robot.
 
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
     """
@@ -55,16 +55,8 @@ class LqrController:
         self._start = t
         found = task.reference(x[:8], c, params)
         states, forces = omni.with_wheels(params, found.x, found.u)
-        self.reference = reference = replace(found, x=states, u=forces)
-        if reference.closed:
-            self.gains = closed_gains(task, params, reference, c)
-        else:
-            _, p_final = lqr_at_end(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
-            self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, t)
-            if task.clock:
-                self.reference = replace(
-                    reference, u=reference.u + feedforward(task, params, reference, c, self.gains, t)
-                )
+        reference = replace(found, x=states, u=forces)
+        self.reference, self.gains = reference_gains(task, params, reference, c, t)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         reference = self.reference
