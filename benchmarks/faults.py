@@ -31,7 +31,7 @@ from ballbot_gym.lazy import load
 from ballbot_train import cli
 from ballbot_train.commands import COMMANDS as COMMAND_ENTRIES
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy_files import SHIPPED
+from ballbot_train.policy.files import SHIPPED
 
 _TIMES = {"plan_seconds", "step_seconds"}  # columns that no two runs share
 _LIMIT = 900.0  # s, after which a command hangs

@@ -21,8 +21,8 @@ import tyro
 
 from ballbot_gym import files
 from ballbot_gym.viewer import Viewer
-from ballbot_train.play.live_page import PATIENCE, PlayPage
-from ballbot_train.play.simulation import Playground
+from ballbot_train.report.live_page import PATIENCE, PlayPage
+from ballbot_train.report.simulation import Playground
 
 _LATE = 0.020  # s after its time: a step that begins later counts as late
 _LEAST_FACTOR, _MOST_LATE, _MOST_GROWTH = 0.99, 0.1, 10.0  # of time, % of the steps, MiB

@@ -20,7 +20,17 @@ ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for 
 
 
 # The rooms from the bottom to the top. A file imports from its own room and from those below it only.
-ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "learning", "report", "play", "commands")
+ROOMS = (
+    "ballbot_gym",
+    "ballbot_baselines",
+    "ballbot_train",
+    "work",
+    "policy",
+    "evaluation",
+    "learning",
+    "report",
+    "commands",
+)
 
 
 @functools.cache
@@ -62,7 +72,7 @@ def room(module):
     if top != "ballbot_train":
         return top if top in PACKAGES else None
     below = inner[0] if inner else ""
-    return "commands" if below == "cli" else below if below in ROOMS else "ground floor"
+    return "commands" if below == "cli" else below if below in ROOMS else top
 
 
 def room_of(path):

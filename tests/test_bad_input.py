@@ -29,7 +29,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.vector import BallbotVectorEnv
-from ballbot_train import evaluate, jobs, load_policy
+from ballbot_train import evaluate, load_policy
 from ballbot_train.cli import _run
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
@@ -37,8 +37,9 @@ from ballbot_train.learning import training
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS, check_settings
-from ballbot_train.policy import PolicyNetwork, save_policy
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.work import jobs
 
 REFUSALS = (ValueError, TypeError, gymnasium.error.Error)
 """What a wrong call may raise."""

@@ -16,7 +16,7 @@ from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.transition import outcome
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.learners.shac import ShacConfig
+from ballbot_train.learning.shac import ShacConfig
 
 STEPS = 16
 CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}

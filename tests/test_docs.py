@@ -17,11 +17,10 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands import COMMANDS
 from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.submissions import read_entries
-from ballbot_train.executors import Workers
-from ballbot_train.learning import training
-from ballbot_train.learning.learners import model_free
-from ballbot_train.policy_files import SHIPPED, shipped_ways, way_of
+from ballbot_train.learning import model_free, training
+from ballbot_train.policy.files import SHIPPED, shipped_ways, way_of
 from ballbot_train.report import figures
+from ballbot_train.work.executors import Workers
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -20,13 +20,13 @@ from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train import console
 from ballbot_train.evaluation import benchmark, evaluate
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, portable
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.policy import PolicyNetwork, save_policy
-from ballbot_train.policy_files import PolicySpec, shipped_policies
+from ballbot_train.policy.files import PolicySpec, shipped_policies
+from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.work import console
 
 
 def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():

@@ -7,10 +7,10 @@ import pytest
 from ballbot_gym import Stabilize
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
+from ballbot_train.evaluation.names import file_part, shortened
 from ballbot_train.evaluation.recordings import file_of
 from ballbot_train.evaluation.results import read_results
-from ballbot_train.names import file_part, shortened
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.policy.files import shipped_policies
 
 NAMES = (
     *(

@@ -20,9 +20,9 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.play.simulation import World
-from ballbot_train.policy import PolicyController, PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyController, PolicyNetwork
+from ballbot_train.report.simulation import World
 
 SPREAD = np.array([1, 1, 0.8, 0.8, 2, 2, 2, 2, 3, 3, 5.0])
 

@@ -11,8 +11,8 @@ import time
 import pytest
 
 from ballbot_gym.viewer import Viewer
-from ballbot_train.play.live_page import PlayPage
-from ballbot_train.play.simulation import Playground
+from ballbot_train.report.live_page import PlayPage
+from ballbot_train.report.simulation import Playground
 
 pytest.importorskip("viser")
 
@@ -82,7 +82,7 @@ def test_what_takes_long_is_said_before_it_is_done(opened, visitor, monkeypatch)
         wait_for(lambda: "preparing NMPC" in visitor.text())
         raise ValueError("no way")
 
-    monkeypatch.setattr("ballbot_train.play.simulation.make_controller", made)
+    monkeypatch.setattr("ballbot_train.report.simulation.make_controller", made)
     visitor.change("Controller", "nmpc")
     wait_for(lambda: "no way" in visitor.text() and visitor.value("Controller") == "lqr")
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ballbot_gym.env import make_task
-from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation.benchmark import Group, run_groups
-from ballbot_train.executors import Workers, completed
 from ballbot_train.learning import tuning
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+from ballbot_train.work import jobs, shards
+from ballbot_train.work.executors import Workers, completed
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.slow

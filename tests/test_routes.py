@@ -14,8 +14,8 @@ from ballbot_train.evaluation import fresh
 from ballbot_train.learning import routing
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork
 
 TASK, PARAMS = make_task("weave"), default_params()
 

@@ -21,10 +21,10 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.train import Run, command_with, parse
-from ballbot_train.learning import training
+from ballbot_train.learning import shac, training
 from ballbot_train.learning.demonstrations import DemoConfig
-from ballbot_train.learning.learners import LEARNERS, shac
-from ballbot_train.policy_files import SHIPPED
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.files import SHIPPED
 
 # From a policy that does nothing, so that episodes end soon.
 SETTINGS = ["--task", "turn", "--iterations", 6, "--evaluations", 1, "--num-envs", 4, "--horizon", 3, "--hidden", 8]

@@ -10,9 +10,10 @@ from resuming import goes_on_as_if_never_stopped
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks import TASKS
-from ballbot_train.learning.learners import LEARNERS, shac
-from ballbot_train.policy import load_network
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.learning import shac
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.files import shipped_policies
+from ballbot_train.policy.network import load_network
 
 
 def made(name, seed=0, robot="paper", start=None, **settings):

@@ -16,7 +16,7 @@ from typing import Any
 try:
     from rich.table import Table
 
-    from ballbot_train.console import PlainConsole
+    from ballbot_train.work.console import PlainConsole
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 
@@ -159,7 +159,7 @@ def _again(command: str, options: list[str]) -> str:
 def _expected() -> tuple[type[RuntimeError], ...]:
     """The other errors that a user can cause. An `except` asks for them when there is an error."""
     from ballbot_gym.rollout import PlanError
-    from ballbot_train.executors import WorkerError
+    from ballbot_train.work.executors import WorkerError
 
     return PlanError, WorkerError
 

@@ -11,14 +11,14 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import RobotName, check_least, console, print_rows, print_table, progress_bars
 from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
 from ballbot_train.evaluation.controllers import make_controller, task_name
-from ballbot_train.executors import Workers
-from ballbot_train.names import file_part
-from ballbot_train.provenance import provenance
+from ballbot_train.evaluation.names import file_part
+from ballbot_train.work import jobs
+from ballbot_train.work.console import RobotName, check_least, console, print_rows, print_table, progress_bars
+from ballbot_train.work.executors import Workers
+from ballbot_train.work.provenance import provenance
 
 _WORST = 10
 _SHOWN_BINS = 6

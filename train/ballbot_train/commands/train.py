@@ -13,10 +13,10 @@ from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import UNNAMED
-from ballbot_train.console import RobotName, check_names, console, option, physics_or_default
-from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS, check_settings
+from ballbot_train.work.console import RobotName, check_names, console, option, physics_or_default
+from ballbot_train.work.executors import Workers
 
 _MOST_THREADS = 1024
 _MOST_VALIDATION_EPISODES = 100_000
@@ -98,7 +98,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     from ballbot_gym.env import make_task
     from ballbot_train.evaluation import optima
     from ballbot_train.learning import training
-    from ballbot_train.policy import load_network
+    from ballbot_train.policy.network import load_network
 
     torch.set_num_threads(run.threads)
     problem, out, varied = make_task(run.task, run.robot), cast(Path, run.out), checked_randomization(run.randomization)
@@ -120,7 +120,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
 def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, Any]:
     """The record of a run; it also says how the demonstrations, or the policy to start from, were made."""
     from ballbot_train.learning.datasets import command_of
-    from ballbot_train.policy_files import read_description
+    from ballbot_train.policy.files import read_description
 
     inputs = [] if run.demos is None else [command_of(run.demos)]
     if run.start is not None:

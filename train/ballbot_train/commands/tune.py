@@ -6,9 +6,9 @@ from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.commands.train import Run, command_with
-from ballbot_train.console import RobotName, check_least, check_names, console, print_table
-from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.work.console import RobotName, check_least, check_names, console, print_table
+from ballbot_train.work.executors import Workers
 
 
 def tune(

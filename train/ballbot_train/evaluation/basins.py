@@ -19,10 +19,10 @@ from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import Controller, PlanError, rollout
-from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import portable
 from ballbot_train.evaluation.evaluate import as_controller
-from ballbot_train.executors import Workers
+from ballbot_train.work import jobs
+from ballbot_train.work.executors import Workers
 
 TASK = "stabilize"
 LEAN_LIMIT = 75.0  # degrees, either side

@@ -19,15 +19,15 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train import jobs
-from ballbot_train.console import check_least, check_names, check_some, markdown, print_table
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import as_controller, run_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns, table_cells
-from ballbot_train.executors import Workers
-from ballbot_train.policy_files import shipped_ways
-from ballbot_train.provenance import provenance
+from ballbot_train.policy.files import shipped_ways
+from ballbot_train.work import jobs
+from ballbot_train.work.console import check_least, check_names, check_some, markdown, print_table
+from ballbot_train.work.executors import Workers
+from ballbot_train.work.provenance import provenance
 
 _TABLES = ("leaderboard", "tracks", "robustness", "transfer", "basins")
 """What runs write as NAME.json when they end."""

@@ -8,8 +8,8 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train.console import check_names
-from ballbot_train.policy_files import is_run, read_description, shipped_policies, weights_digest
+from ballbot_train.policy.files import is_run, read_description, shipped_policies, weights_digest
+from ballbot_train.work.console import check_names
 
 FILTERED = "-ekf"
 """Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
@@ -67,7 +67,7 @@ def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
         PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
     """
     if is_saved_model(name):
-        from ballbot_train.saved_models import fits  # it imports torch
+        from ballbot_train.policy.saved_models import fits  # it imports torch
 
         return fits(plain(name), task, named_robot(robot))
     spec = read_description(plain(name))["spec"]
@@ -81,7 +81,7 @@ def made_for(name: str) -> str:
         PolicyError: the file is missing or damaged.
     """
     if is_saved_model(name):
-        from ballbot_train.saved_models import read
+        from ballbot_train.policy.saved_models import read
 
         return f"a task with {read(plain(name)).observations} observations"
     spec = read_description(plain(name))["spec"]
@@ -182,10 +182,10 @@ def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
             f"unknown controller {name!r}; {task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
         )
     if is_saved_model(name):
-        from ballbot_train.policy import PolicyController  # it imports torch
-        from ballbot_train.saved_models import load_actor
+        from ballbot_train.policy.network import PolicyController  # it imports torch
+        from ballbot_train.policy.saved_models import load_actor
 
         return PolicyController(task, params, load_actor(name, task, params))
-    from ballbot_train.policy import load_policy
+    from ballbot_train.policy.network import load_policy
 
     return load_policy(shipped.get(name, name), task, params)

@@ -21,13 +21,13 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
-from ballbot_train.console import late_bar
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import make_controller, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.executors import Workers
-from ballbot_train.policy_files import PolicyError
-from ballbot_train.provenance import provenance
+from ballbot_train.policy.files import PolicyError
+from ballbot_train.work.console import late_bar
+from ballbot_train.work.executors import Workers
+from ballbot_train.work.provenance import provenance
 
 
 def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
@@ -68,7 +68,7 @@ class Predictor:
     def __init__(self, model: Any, task: Task, params: BallbotParams):
         self._model, self._state, self.history = model, None, 0
         if hasattr(model, "observation_space"):
-            from ballbot_train.saved_models import check_spaces, history_of  # it imports torch
+            from ballbot_train.policy.saved_models import check_spaces, history_of  # it imports torch
 
             self.history = history_of(model, task, params)
             check_spaces(type(model).__name__, model, task, params)
@@ -160,7 +160,7 @@ def _kept(out: Path, ran: dict[str, Any], row: Row) -> list[Result]:
     """
     if not (out / "leaderboard.json").exists():
         return []
-    from ballbot_train import jobs  # it needs the library of locks
+    from ballbot_train.work import jobs  # it needs the library of locks
 
     about, results = read_results(out)
     jobs.check_same({key: about.get(key) for key in ran}, ran, out, "results")

@@ -39,11 +39,11 @@ from ballbot_gym.identity import named_problem_digest
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train import executors, jobs
-from ballbot_train.console import progress_bars
-from ballbot_train.executors import Workers
-from ballbot_train.learning import training
-from ballbot_train.learning.learners import LEARNERS, ppo, sac
+from ballbot_train.learning import ppo, sac, training
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.work import executors, jobs
+from ballbot_train.work.console import progress_bars
+from ballbot_train.work.executors import Workers
 
 with imports_of("ballbot tune", "tune"):
     import optuna

@@ -35,8 +35,8 @@ from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, actor_for, average_of
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.weights import linear_layers
+from ballbot_train.policy.network import PolicyNetwork
+from ballbot_train.policy.weights import linear_layers
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,10 @@ from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, highest_value
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, seen_in
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, seen_in
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import Mirrors
+from ballbot_train.policy.files import Mirrors
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
-from ballbot_train.console import markdown_text
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.simulation import Playground, Start, severities
 from ballbot_train.report import labels
+from ballbot_train.report.simulation import Playground, Start, severities
+from ballbot_train.work.console import markdown_text
 
 PATIENCE = 0.1
 """s of lag that is caught up; more, as of a planner, is given up."""

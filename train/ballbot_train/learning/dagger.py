@@ -39,7 +39,7 @@ from ballbot_train.learning.actors import RoutedSymmetry, actor_for
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)

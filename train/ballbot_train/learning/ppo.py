@@ -24,9 +24,9 @@ from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, relative_advantages
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ballbot_gym.tasks import Task
 if TYPE_CHECKING:
     from ballbot_gym.randomization import Randomization
     from ballbot_train.learning.training import Learner
-    from ballbot_train.policy import PolicyNetwork
+    from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Algorithm:
             if self.name != "shac" or settings.horizon or randomization is None or not randomization.varies_robot:
                 raise ValueError("only shac with --horizon 0 trains informed policies, with --randomization unknown")
             given["informed"] = True
-        with load("ballbot_train.weights:own_defaults")():
+        with load("ballbot_train.policy.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
 
 
@@ -155,7 +155,7 @@ def check_settings(settings: Any) -> None:
         )
 
 
-_HERE = __name__
+_HERE = __name__.rpartition(".")[0]
 
 LEARNERS: dict[str, Algorithm] = {
     "dagger": Algorithm(f"{_HERE}.dagger", "DAgger, labelled by the optimum", demonstrations=True),
