@@ -131,7 +131,7 @@ COMMANDS = {
     "ppo": _train("ppo", _RL),
     "ppo from a policy": _train("ppo", f"{_RL} --start {SHIPPED / 'turn-dagger.json'}"),
     "sac": _train("sac", _RL),
-    "shac": _train("shac", "--iterations 8 --num-envs 4 --horizon 3"),
+    "apg": _train("apg", "--iterations 8 --num-envs 4 --episode-seconds 0.06"),
 }
 
 

@@ -201,12 +201,12 @@ def _demos(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...
 def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
     from ballbot_gym.params import default_params
-    from ballbot_train.learning import shac, training
+    from ballbot_train.learning import apg, training
     from ballbot_train.work import jobs
 
-    task, config = make_task("turn"), {"learner": "shac", "task": "turn"}
-    settings = shac.ShacConfig(iterations=2, evaluations=1, num_envs=2, horizon=2, hidden=(4,))
-    made = shac.Shac(task, default_params(), settings)
+    task, config = make_task("turn"), {"learner": "apg", "task": "turn"}
+    settings = apg.ApgConfig(iterations=2, evaluations=1, num_envs=2, episode_seconds=0.04, hidden=(4,))
+    made = apg.Apg(task, default_params(), settings)
     run = training._Run(made, task, config | {"settings": asdict(settings)}, folder / "run", False)
     run.score()
     run.save()
@@ -214,7 +214,7 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type
     def resume() -> None:
         jobs.unlock(folder / "run")
         training._Run(
-            shac.Shac(task, default_params(), settings),
+            apg.Apg(task, default_params(), settings),
             task,
             config | {"settings": asdict(settings)},
             folder / "run",

@@ -28,7 +28,7 @@ CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where 
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
     "dagger": "--iterations 1 --episodes-per-iteration 4 --gradient-steps 5",
     "ppo": "--iterations 1 --num-envs 64 --num-steps 48",
-    "shac": "--iterations 1 --num-envs 8 --horizon 4",
+    "apg": "--iterations 1 --num-envs 8 --episode-seconds 0.1",
 }
 OTHERS = {"--help", "--version", "--env-id"}
 """Options on pages that are not listed by the help of a command: of all commands, and of another program."""

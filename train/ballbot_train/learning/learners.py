@@ -1,20 +1,18 @@
-"""Learning algorithms by name, one file each.
+"""Learning algorithms by name.
 
-A new learner is one file and one line in `LEARNERS`. Its file holds
+A new learner is one file and one entry of `LEARNERS`, which declares what the learner can do. Its file holds
 
-- a frozen dataclass of settings whose defaults suit any task, with a docstring under every field;
+- a frozen dataclass of `Settings` whose defaults suit any task, with a docstring under every field;
 - `TUNED`, settings by name of task, and by "" for any other task; `WARM`, where they differ after a warm start;
-- `make(task, params, settings, seed, demos, start)`, which returns the learner before its first iteration (see
-  `training.Learner`).
+- `make(task, params, settings, seed, ...)`, which returns the learner before its first iteration (see `training.Learner`).
+  What the entry declares may be passed too, by name: demos, start, randomization, history, informed.
 """
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ballbot_gym.checks import MOST_ENVS
 from ballbot_gym.lazy import load
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -33,8 +31,20 @@ class Algorithm:
     """The file, as for an import."""
     description: str
     """One line for the command line."""
-    demonstrations: bool
-    """Whether the learner can use demonstrations."""
+    demonstrations: bool = False
+    """Whether it learns from demonstrations."""
+    start: bool = False
+    """Whether it trains on from a policy."""
+    tracks: bool = False
+    """Whether it trains where a randomization varies the robot, the delay or the sensors."""
+    history: bool = False
+    """Whether it trains policies that see earlier observations and actions."""
+    informed: bool = False
+    """Whether it trains policies that are given each robot's parameters, and run behind a filter."""
+    wheels: bool = False
+    """Whether it trains robots with wheels."""
+    clock: bool = False
+    """Whether it trains tasks whose cost and goal depend on the time."""
 
     @property
     def name(self) -> str:
@@ -55,12 +65,33 @@ class Algorithm:
             table = getattr(import_module(self.module), "WARM", table)
         return table.get(task, table[""])
 
-    def check(self, demos: object, start: object) -> None:
-        """Raises a ValueError where demonstrations are of no use to this learner, or a policy to start from beside them."""
-        if demos is not None and not self.demonstrations:
-            raise ValueError(f"{self.name} uses no demonstrations")
+    def check(
+        self,
+        task: Task,
+        params: BallbotParams,
+        demos: object = None,
+        start: object = None,
+        randomization: "Randomization | None" = None,
+        history: int = 0,
+        informed: bool = False,
+    ) -> None:
+        """Raises a ValueError where the learner does not support what is asked of it; arguments as of `make`."""
+        wanted = {
+            "demonstrations": demos is not None,
+            "start": start is not None,
+            "tracks": randomization is not None,
+            "history": history > 0,
+            "informed": informed,
+            "wheels": params.wheels is not None,
+            "clock": task.clock,
+        }
+        for ability in (name for name, is_wanted in wanted.items() if is_wanted and not getattr(self, name)):
+            able = [name for name, other in LEARNERS.items() if getattr(other, ability)]
+            raise ValueError(f"{self.name} does not support {_WORDS[ability]}; train with {' or '.join(able)}")
         if demos is not None and start is not None:
             raise ValueError("training starts from demonstrations or from a policy; give one of --demos and --start")
+        if informed and (randomization is None or not randomization.varies_robot):
+            raise ValueError("an informed policy needs a track on which the robot varies; give --randomization unknown")
 
     def make(
         self,
@@ -83,83 +114,67 @@ class Algorithm:
             seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
             start: a policy to train on from, or None; it may be of another robot.
-            randomization: what varies in training, for dagger, ppo and shac.
-            history: how many earlier observations and actions the policy sees, for dagger, ppo and shac.
-            informed: whether the policy is told each robot, for shac with horizon 0.
+            randomization: what varies in training.
+            history: how many earlier observations and actions the policy sees.
+            informed: whether the policy is given each robot's parameters.
 
         Returns:
             The learner before its first iteration.
 
         Raises:
-            ValueError: demonstrations or policy are missing, of another task or shape, or of no use to this learner.
+            ValueError: the learner does not support one of these, a setting is out of its range, or demonstrations or policy
+                are missing, or of another task or shape.
         """
-        self.check(demos, start)
-        if task.clock and (self.name == "dagger" or getattr(settings, "horizon", 0)):
-            raise ValueError(
-                f"cost and goal of {task.id} depend on the time, which {self.name} does not know; train ppo or sac, and "
-                "from such a policy shac with --horizon 0"
-            )
-        if params.wheels is not None and self.name in ("ppo", "sac"):
-            raise ValueError(
-                f"{self.name} here knows no robot with wheels; train shac or dagger, or Stable-Baselines3 on the env itself"
-            )
-        given: dict[str, Any] = {"demos": demos, "start": start}
-        if randomization is not None or history:
-            if self.name == "sac":
-                raise ValueError("sac knows no randomization and no history; train dagger, ppo or shac")
-            given |= {"randomization": randomization, "history": history}
-        if informed:
-            if self.name != "shac" or settings.horizon or randomization is None or not randomization.varies_robot:
-                raise ValueError("only shac with --horizon 0 trains informed policies, with --randomization unknown")
-            given["informed"] = True
+        self.check(task, params, demos, start, randomization, history, informed)
+        settings.check()
+        optional = {"demos": demos, "start": start, "randomization": randomization}
+        optional |= {"history": history or None, "informed": informed or None}
+        given = {name: value for name, value in optional.items() if value is not None}
         with load("ballbot_train.policy.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
 
 
-_MAY_BE_ZERO = {"gathering_iterations", "horizon"}
-_MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction"}
-_POSITIVE = {"critic_learning_rate", "final_std", "learning_rate", "std"}
-_MOST = 10**9  # of whole numbers
-_MOST_OF = {"buffer_size": 10**8, "hidden": 2**14, "horizon": 10**5, "num_envs": MOST_ENVS, "num_steps": 10**6}
-_MOST_STEPS = 10**8  # env steps of an iteration, which are all in memory
-
-
-def check_settings(settings: Any) -> None:
-    """Raises a ValueError that names the first of a learner's settings that makes no sense.
-
-    Whole numbers are positive, except those that switch something off with 0. Other numbers are finite and at least 0;
-    discounts and the like are at most 1.
-    """
-    for field in fields(settings):
-        name, value = field.name, getattr(settings, field.name)
-        for number in value if isinstance(value, tuple) else [value]:
-            if isinstance(number, bool) or not isinstance(number, int | float):
-                continue
-            if isinstance(number, int):
-                least, most = 0 if name in _MAY_BE_ZERO else 1, _MOST_OF.get(name, _MOST)
-                if not least <= number <= most:
-                    raise ValueError(f"{name} must be {least} to {most}, not {number}")
-            elif name in _SHARES and not 0 <= number <= 1:
-                raise ValueError(f"{name} must be 0 to 1, not {number}")
-            elif name in _POSITIVE and not 0 < number < math.inf:
-                raise ValueError(f"{name} must be finite and positive, not {number}")
-            elif not math.isfinite(number) or (number < 0 and name not in _MAY_BE_NEGATIVE):
-                raise ValueError(f"{name} must be finite and at least 0, not {number}")
-    envs = getattr(settings, "num_envs", 1)
-    steps = getattr(settings, "num_steps", getattr(settings, "horizon", 1))
-    if envs * steps > _MOST_STEPS:
-        raise ValueError(
-            f"{envs} envs of {steps} steps are {envs * steps} env steps per iteration, and at most {_MOST_STEPS} are kept in "
-            "memory; take fewer of either"
-        )
-
+_WORDS = {
+    "demonstrations": "demonstrations",
+    "start": "a policy to start from",
+    "tracks": "tracks (--randomization)",
+    "history": "a history (--history)",
+    "informed": "informed policies (--informed)",
+    "wheels": "robots with wheels",
+    "clock": "tasks whose cost or goal depends on the time",
+}
+"""What messages call the abilities of an `Algorithm`."""
 
 _HERE = __name__.rpartition(".")[0]
 
 LEARNERS: dict[str, Algorithm] = {
-    "dagger": Algorithm(f"{_HERE}.dagger", "DAgger, labelled by the optimum", demonstrations=True),
-    "ppo": Algorithm(f"{_HERE}.ppo", "proximal policy optimization", demonstrations=True),
-    "sac": Algorithm(f"{_HERE}.sac", "soft actor-critic", demonstrations=True),
-    "shac": Algorithm(f"{_HERE}.shac", "short-horizon actor-critic", demonstrations=False),
+    "apg": Algorithm(
+        f"{_HERE}.apg",
+        "analytic policy gradient, through whole episodes",
+        start=True,
+        tracks=True,
+        history=True,
+        informed=True,
+        wheels=True,
+        clock=True,
+    ),
+    "dagger": Algorithm(
+        f"{_HERE}.dagger",
+        "DAgger, labelled by the optimum",
+        demonstrations=True,
+        start=True,
+        tracks=True,
+        history=True,
+        wheels=True,
+    ),
+    "ppo": Algorithm(
+        f"{_HERE}.ppo",
+        "proximal policy optimization",
+        demonstrations=True,
+        start=True,
+        tracks=True,
+        history=True,
+        clock=True,
+    ),
+    "sac": Algorithm(f"{_HERE}.sac", "soft actor-critic", demonstrations=True, start=True, clock=True),
 }

@@ -10,6 +10,7 @@ _CONTROLLERS = {
     "dagger": ("DAgger", "#34495e"),
     "ppo": ("PPO", "#2e8b57"),
     "sac": ("SAC", "#17a2b8"),
+    "apg": ("APG", "#8e44ad"),
     "shac": ("SHAC", "#8e44ad"),
 }
 ORDER = [name for name, _ in _CONTROLLERS.values()]
