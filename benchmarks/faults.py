@@ -82,19 +82,6 @@ def _fresh(out: Path) -> Made:
     return {"fresh.csv": (out / "fresh.csv").read_text()}
 
 
-def _search(out: Path) -> Made:
-    """How many trials a search has, and what that one reached whose settings are the learner's own.
-
-    It is the first that begins. Where it is killed, it begins again after others.
-    """
-    import optuna
-
-    study = optuna.load_study(study_name="tune", storage=f"sqlite:///{out.absolute()}/study.db")
-    trials = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
-    (own,) = (trial for trial in trials if trial.params == study.trials[0].system_attrs["fixed_params"])
-    return {"trials": len(trials), "own": {key: value for key, value in own.user_attrs.items() if key != "cpu_minutes"}}
-
-
 def _policy(out: Path) -> Made:
     return {"weights": (out / "policy.safetensors").read_bytes()}
 
@@ -122,7 +109,6 @@ COMMANDS = {
     "transfer": _command(
         "transfer --tasks turn --controllers lqr --made-for paper rolling --episodes 20 --physics rk4", _episodes
     ),
-    "tune": _command("tune ppo --task turn --trials 3 --seeds 1 --env-steps 8192 --evaluations 2", _search),
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
     "bc": _train("dagger", "--iterations 6 --gathering-iterations 0 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(

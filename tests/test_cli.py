@@ -112,7 +112,6 @@ def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, ho
         (("train", "apg", "--taks", "turn"), "--task", "ballbot train apg --help"),
         (("train", "--taks", "turn"), "", "ballbot train --help"),
         (("train", "apg", "--task"), "--task", "ballbot train apg --help"),
-        (("tune", "ppo", "--tiral", "3"), "--trials", "ballbot tune --help"),
         (("benchmark", "--taks", "turn"), "--tasks", "ballbot benchmark --help"),
     ],
 )

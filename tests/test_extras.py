@@ -30,7 +30,6 @@ MISSING = [  # in an order in which nothing imports what is missing later
         "from ballbot_train.work.executors import Workers, completed; list(completed([(0, int, ())], Workers(ray='local')))",
         *("ray", "ray"),
     ),
-    ("import ballbot_train.learning.tuning", "optuna", "tune"),
     ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
 ]
 

@@ -209,9 +209,7 @@ def parsed(command):
     return calls[0]
 
 
-RECORDED = {
-    path.stem: json.loads(path.read_text())["training"]["command"] for path in sorted(SHIPPED.glob("*.json"))
-}
+RECORDED = {path.stem: json.loads(path.read_text())["training"]["command"] for path in sorted(SHIPPED.glob("*.json"))}
 BY_AN_EARLIER_VERSION = {name for name, command in RECORDED.items() if "ballbot train shac" in command}
 
 

@@ -22,7 +22,7 @@ except ModuleNotFoundError as error:
 
     sys.exit(str(missing("ballbot", error.name, "train")))
 
-from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, MOVED, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -62,6 +62,9 @@ def _run(arguments: list[str]) -> int:
 
         sys.stdout.write(f"ballbot {version('ballbot-gym')}\n")
         return 0
+    if command in MOVED:
+        errors.print(MOVED[command], style="red")
+        return 2
     if command not in COMMANDS:
         close = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
