@@ -31,7 +31,7 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import evaluate, load_policy
 from ballbot_train.cli import _run
-from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
 from ballbot_train.learning import training
 from ballbot_train.learning.datasets import load_demos
@@ -565,6 +565,9 @@ TYPED = [
     ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
     ("evaluate shac --fresh 0", "the number of fresh episodes must be 1 to 1,000,000, not 0"),
+    ("evaluate shac --optima 11", "give --optima with --fresh"),
+    ("evaluate shac --fresh 10 --physics bullet", "leave out --physics"),
+    ("evaluate shac --episodes 201", "episodes must be 1 to 200, not 201"),
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),

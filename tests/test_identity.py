@@ -11,7 +11,7 @@ from ballbot_gym.identity import observation_digest, problem_digest, robot_diges
 from ballbot_gym.robots import ROBOTS, Robot
 from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
-from ballbot_train.evaluation.benchmark import open_run
+from ballbot_train.evaluation.runner import open_run
 from ballbot_train.policy.files import PolicyError, PolicySpec, read_description
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 from ballbot_train.work import jobs

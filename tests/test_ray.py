@@ -9,7 +9,7 @@ import pytest
 
 from ballbot_gym.env import make_task
 from ballbot_train.commands.certify import certify
-from ballbot_train.evaluation.benchmark import Group, run_groups
+from ballbot_train.evaluation.runner import Group, run_groups
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.work import jobs, shards

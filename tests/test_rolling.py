@@ -24,7 +24,7 @@ from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
-from ballbot_train.evaluation.benchmark import controllers_by_robot
+from ballbot_train.evaluation.controllers import controllers_by_robot
 from ballbot_train.policy.files import PolicyError, PolicySpec, shipped_policies
 from ballbot_train.policy.network import load_network, load_policy
 

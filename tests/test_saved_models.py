@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
-from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.policy.files import PolicyError

@@ -24,8 +24,7 @@ from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
-from ballbot_train.evaluation.benchmark import controllers_of
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import controllers_of, make_controller
 from ballbot_train.evaluation.fresh import as_batch_policy, evaluate_fresh
 from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started

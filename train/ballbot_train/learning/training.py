@@ -54,7 +54,7 @@ from ballbot_gym.identity import digest, problem_digest
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation import evaluate, fresh
+from ballbot_train.evaluation import evaluate, fresh, runner
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
@@ -330,7 +330,7 @@ class _Run:
         network = load_network(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
         controller = make_controller(str(self.out / "policy.json"), self.task, env.params)
-        results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
+        results = runner.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
         row = evaluate.summarize(results)
         figures = ("episodes", "success", "falls", "regret_mean", "regret_median")
