@@ -1,7 +1,7 @@
-"""The version of the benchmark: which episodes, costs, observations and optima a regret is of.
+"""The version of the benchmark: the episodes, costs, observations and optima that a regret refers to.
 
-Ids such as `BallbotTurn-v0` name an environment, and stay. Certified sets, results and the leaderboard's rows hold the
-version, and what is of another one is refused.
+Certified sets, results and the leaderboard's rows hold the version, and those of another version are refused.
+CONTRIBUTING.md says when this version changes, and when an id such as `BallbotTurn-v0` does.
 """
 
 BENCHMARK = "1"

@@ -138,9 +138,11 @@ class PlayPage:
         with self._lock:
             asked, self._asked = self._asked, {}
         for name, value in asked.items():
+            control = self._controls.get(name)
+            if control is None:  # which went with the task or robot that another request has replaced
+                continue
             self.playground.notice = ""
             try:
-                control = self._controls[name]
                 control.apply(control.checked(value))
             except Exception as error:
                 self.playground.notice = str(error) or repr(error)
