@@ -102,7 +102,7 @@ def check(distribution: Path, extras: str) -> None:
     print(f"{distribution.name}{extras}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         stranger = Stranger(distribution, extras, Path(folder))
-        assert "commands:" in stranger.run("ballbot", "--help")
+        assert "measure:" in stranger.run("ballbot", "--help")
         stranger.run("ballbot", "--version")
         if not extras:
             print(stranger.run("python", "-", code=ALONE), end="")

@@ -20,6 +20,7 @@ from ballbot_train.executors import Workers
 from ballbot_train.names import file_part
 from ballbot_train.provenance import provenance
 
+_OPTIMA = 100  # fresh episodes whose regret is shown unless another number is given
 _WORST = 10
 _SHOWN_BINS = 6
 _FULL_BIN = 20  # episodes from which a bin is called weak
@@ -31,7 +32,7 @@ def evaluate(
     task: str | None = None,
     fresh: int = 10_000,
     seed: int = 0,
-    optima: int = 0,
+    optima: int | None = None,
     out: Path | None = None,
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
@@ -45,8 +46,9 @@ def evaluate(
         task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
         fresh: how many fresh episodes, in the batched closed-form model. They are never the certified ones.
         seed: of the fresh episodes.
-        optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
-            user's cache folder, for later calls and other policies.
+        optima: of how many fresh episodes, from the first, the optimum is found too, for their regret; default the first
+            100, and none where --randomization varies what optima depend on. Optima stay in the user's cache folder, for
+            later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
         workers: who finds optima.
         robot: whose episodes.
@@ -55,6 +57,8 @@ def evaluate(
     varied = checked_randomization(randomization)
     task = task_name(policy, task, robot)
     controllers_of([task], [policy], robot)
+    if optima is None:
+        optima = 0 if varied.moves_optima else min(_OPTIMA, fresh)
     check_least(0, optima=optima)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
