@@ -107,7 +107,7 @@ platforms: .venv-pythons/uv/$(SCRIPTS)/uv
 code: build/code/codes.json
 
 build/code/codes.json: $(VENV)/installed $(shell find ballbot_gym baselines -name "*.py" -o -name "*.[ch]")
-	rm -rf build/code
+	rm -f build/code/*.c build/code/source/*
 	$(BIN)/python release/generated.py build/code
 
 # what is published, in dist/: the source, a wheel for every machine, and one with compiled code for machines like this one. Each
