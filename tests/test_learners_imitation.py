@@ -13,9 +13,9 @@ from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train.learning import routing, training
+from ballbot_train.learning import dagger, routing, training
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.learners import LEARNERS, dagger
+from ballbot_train.learning.learners import LEARNERS
 
 CLONING = dagger.DaggerConfig(iterations=4, gathering_iterations=0, gradient_steps=20, batch_size=128, hidden=(16,))
 TINY_DAGGER = dagger.DaggerConfig(
@@ -135,7 +135,7 @@ def test_optima_are_found_one_by_one_where_they_cannot_be_found_at_once(monkeypa
     task, params, config = make_task("stabilize"), default_params(), replace(TINY_DAGGER, episodes_per_iteration=2)
     at_once, alone = dagger.Dagger(task, params, config), dagger.Dagger(task, params, config)
     at_once.iterate()
-    monkeypatch.setattr(batched, "solves", lambda task, params: False)
+    monkeypatch.setattr(batched, "_solves", lambda task, params: False)
     alone.iterate()
     first, second = (each.state_dict()["samples"][1].numpy() for each in (at_once, alone))
     np.testing.assert_allclose(second[:20], first[:20], atol=0.02)

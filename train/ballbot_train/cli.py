@@ -20,13 +20,13 @@ from typing import Any
 try:
     from rich.table import Table
 
-    from ballbot_train.console import PlainConsole
+    from ballbot_train.work.console import PlainConsole
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 
     sys.exit(str(missing("ballbot", error.name, "train")))
 
-from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -66,6 +66,9 @@ def _run(arguments: list[str]) -> int:
 
         sys.stdout.write(f"ballbot {version('ballbot-gym')}\n")
         return 0
+    if command in MOVED:
+        errors.print(MOVED[command], style="red")
+        return 2
     if command not in COMMANDS:
         close = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
@@ -186,21 +189,24 @@ def _again(command: str, options: list[str]) -> str:
 def _expected() -> tuple[type[RuntimeError], ...]:
     """The other errors that a user can cause. An `except` asks for them when there is an error."""
     from ballbot_gym.rollout import PlanError
-    from ballbot_train.executors import WorkerError
+    from ballbot_train.work.executors import WorkerError
 
     return PlanError, WorkerError
 
 
 def _print_help() -> None:
     console = PlainConsole(highlight=False)
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name in COMMANDS:
-        table.add_row(name, help_of(name))
     console.width = max(console.width, _LEAST_WIDTH)
-    console.print(f"usage: ballbot COMMAND [OPTIONS]\n\n{_DESCRIPTION}\n\ncommands:")
-    console.print(table)
+    console.print(f"usage: ballbot COMMAND [OPTIONS]\n\n{_DESCRIPTION}")
+    widest = max(map(len, COMMANDS))
+    for group, names in GROUPS.items():
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
+        table.add_column(style="bold", no_wrap=True, min_width=widest)
+        table.add_column(overflow="fold")
+        for name in names:
+            table.add_row(name, help_of(name))
+        console.print(f"\n{group}:")
+        console.print(table)
     console.print("\n`ballbot COMMAND --help` lists the options of a command; `ballbot --version` says the version.")
 
 

@@ -24,28 +24,6 @@ _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions 
 _QP_ITERATIONS = 30
 
 
-def grid(steps: int, nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`nodes` intervals N over a number of control steps: the first one step, the rest as equal as can be.
-
-    Returns:
-        How many control steps after now the nodes lie, (N+1,). What takes values at the nodes to the values one control step
-        later, linear between and constant beyond, (N+1, N+1). What takes values held over the intervals to their means one
-        control step later, 0 beyond the end, (N, N).
-
-    Raises:
-        ValueError: fewer than 2 nodes, or fewer control steps than nodes.
-    """
-    if not 2 <= nodes <= steps:
-        raise ValueError(f"a horizon of {steps} control steps takes 2 to {steps} nodes, not {nodes}")
-    base, longer = divmod(steps - 1, nodes - 1)
-    lengths = np.array([1] + [base] * (nodes - 1 - longer) + [base + 1] * longer)
-    offsets = np.concatenate([[0], np.cumsum(lengths)])
-    of_states = np.array([np.interp(offsets + 1, offsets, unit) for unit in np.eye(nodes + 1)]).T
-    held = np.repeat(np.eye(nodes), lengths, axis=0)  # (steps, N)
-    later = np.vstack([held[1:], np.zeros((1, nodes))])
-    return offsets, of_states, np.add.reduceat(later, offsets[:-1], axis=0) / lengths[:, None]
-
-
 class _Pattern:
     """Where a matrix (height, width) has entries: in blocks, of rows (K, r) and columns (K, c) of K dense parts each."""
 
@@ -232,10 +210,8 @@ class HorizonQp:
         return np.take_along_axis(margins, least, 1), np.take_along_axis(slopes, least[:, None, :], 2)
 
 
-@lru_cache(maxsize=16)
-def horizon_qp(task: Task, kind: Kind, nodes: int) -> HorizonQp:
-    """The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
-    return HorizonQp(task, kind, nodes)
+horizon_qp = lru_cache(maxsize=16)(HorizonQp)
+"""The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
 
 
 @lru_cache(maxsize=16)

@@ -183,44 +183,39 @@ def _corrected(
 
 _DRAWN = 256  # starts that tell what to expect of one
 _KNOWN = 1e-3  # standard deviation of what they all share, SI units
-WHEELS_ERROR = np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
-"""Variances (14,) that the model does not explain, per control step."""
-
-
-def readings_variance(dt: float) -> np.ndarray:
-    """Variances (9,) of the noise of what sensors read over a control step of dt, s, in SI units."""
-    samples = sensors.samples(dt)
-    noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
-    return np.array([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
-
-
-def expected_start(task: Task, params: Robot, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is expected (14,) where an episode with constants c (nc,) begins, and its standard deviations."""
-    draws = np.random.default_rng(0).random((_DRAWN, task.state_draws))
-    starts = np.array([task.start(tuple(z), tuple(c), params) for z in draws.tolist()])
-    starts[:, :2] = 0.0  # which the robot is told
-    deviations = [*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]
-    return np.concatenate([starts.mean(0), np.zeros(3)]), np.array(deviations)
 
 
 class SensorFilter:
     """Estimates the state `x` (11,) of a robot with wheels from its sensors and the forces of its wheels.
 
     The robot and its delay are known: `factors` and `delay` are as of a `TrackFilter` that has nothing to estimate.
+
+    | attribute | shape | meaning |
+    |---|---|---|
+    | `model` | | CasADi function of the state and the wheels' forces; see below |
+    | `model_variance` | (14,) | what the model does not explain, per control step |
+    | `reading_variance` | (9,) | the noise of what sensors read over a control step |
+
+    `model` takes x (11,) and u (3,), N. It returns the rates of x over ideal readings (9,), and their Jacobian (20, 11) with
+    respect to x.
     """
 
     factors, delay = np.ones(3), 0
+    model_variance = np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
 
     def __init__(self, task: Task, params: Robot):
         self._task, self._params, self._dt = task, params, task.control_dt
-        self._model, (self._after, self._over_step) = robot_and_sensors(params), _control_step(params, task.control_dt)
-        self._noise = np.diag(readings_variance(task.control_dt))
+        self.model, (self._after, self._over_step) = _robot_and_sensors(params), _control_step(params, task.control_dt)
+        samples = sensors.samples(task.control_dt)
+        noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
+        self.reading_variance = np.array([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        self._noise = np.diag(self.reading_variance)
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
         """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
-        mean, deviations = expected_start(self._task, self._params, c)
+        mean, deviations = self.expected_start(c)
         self._z, self._p = np.concatenate([seen[9:11], mean[2:]]), np.diag(deviations) ** 2
-        found, slopes = self._model(self._z[:11], np.zeros(3))
+        found, slopes = self.model(self._z[:11], np.zeros(3))
         self._correct(seen, found[11:], slopes[11:, :])
 
     def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
@@ -231,7 +226,15 @@ class SensorFilter:
         self._z[:11], slopes = np.array(after)[:, 0], np.array(slopes)
         self._p[:11] = slopes @ self._p[:11]
         self._p[:, :11] = self._p[:, :11] @ slopes.T
-        self._p += np.diag(WHEELS_ERROR)
+        self._p += np.diag(self.model_variance)
+
+    def expected_start(self, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is expected (14,) where an episode with constants c (nc,) begins, and its standard deviations."""
+        draws = np.random.default_rng(0).random((_DRAWN, self._task.state_draws))
+        starts = np.array([self._task.start(tuple(z), tuple(c), self._params) for z in draws.tolist()])
+        starts[:, :2] = 0.0  # which sensors report
+        deviations = [*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]
+        return np.concatenate([starts.mean(0), np.zeros(3)]), np.array(deviations)
 
     def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
         """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
@@ -283,7 +286,7 @@ class StateFromSensors(gymnasium.Wrapper):
 
 
 @lru_cache(maxsize=16)
-def robot_and_sensors(params: Robot) -> casadi.Function:
+def _robot_and_sensors(params: Robot) -> casadi.Function:
     """(x, u) -> rates of the state x (11,) over ideal readings (9,), under the wheels' forces u (3,), N, and their Jacobian
     (20, 11) with respect to x.
     """
@@ -298,7 +301,7 @@ def _control_step(params: Robot, dt: float) -> tuple[casadi.Function, casadi.Fun
     """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives
     its Jacobian with respect to x too.
     """
-    model, substeps = robot_and_sensors(params), substeps_for(dt)
+    model, substeps = _robot_and_sensors(params), substeps_for(dt)
     x, u, own = casadi.MX.sym("x", 11), casadi.MX.sym("u", 3), casadi.DM.eye(11)
     after, slopes, h = x, own, dt / substeps
     for _ in range(substeps):

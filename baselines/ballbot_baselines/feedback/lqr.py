@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines.solvers.riccati import closed_gains, discrete_lqr, feedforward, lqr_at_end, tracking_gains
+from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium, reference_gains
 from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
@@ -46,9 +46,11 @@ class LqrController:
 
     About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
     gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one,
-    with forces that look ahead, because it may be no motion of the robot (`feedforward`).
+    with forces that look ahead, because it may be no motion of the robot.
 
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
+
+    `reset` raises a PlanError where the reference is a single point that is no equilibrium.
     """
 
     def __init__(self, task: Task, params: Robot):
@@ -59,16 +61,13 @@ class LqrController:
         self._start = t
         found = task.reference(x, c, params)
         states, forces = params.extended(found.x, found.u)
-        self.reference = reference = replace(found, x=states, u=forces)
-        if reference.closed:
-            self.gains = closed_gains(task, params, reference, c)
-        else:
-            _, p_final = lqr_at_end(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
-            self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, t)
-            if task.clock:
-                self.reference = replace(
-                    reference, u=reference.u + feedforward(task, params, reference, c, self.gains, t)
-                )
+        if len(states) == 1 and not is_equilibrium(params, states[0], forces[0]):
+            raise PlanError(
+                f"LQR of {task.id} would hold the robot at one point that it leaves by itself: a reference of one point must "
+                f"rest. Let {type(task).__name__}.reference return a motion, with one point per control step"
+            )
+        reference = replace(found, x=states, u=forces)
+        self.reference, self.gains = reference_gains(task, params, reference, c, t)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         reference = self.reference

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
-from ballbot_baselines.feedback.horizon import grid, horizon_qp
+from ballbot_baselines.feedback.horizon import horizon_qp
 from ballbot_baselines.feedback.tvlqr import TvlqrController
 from ballbot_baselines.optimum.find import plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
@@ -44,7 +44,7 @@ _TOLERANCE = 1e-4  # a search has converged when no input changes by more than t
 
 
 @dataclass
-class Counts:
+class _Counts:
     """What happened since the controller was made.
 
     | count | of |
@@ -104,11 +104,11 @@ class NmpcController:
         if steps < 0 or abs(steps * task.control_dt - horizon) > 1e-9:
             raise ValueError(f"horizon must be a whole number of control steps of {task.control_dt} s, not {horizon} s")
         nodes = min(nodes or (steps if params.grips else _NODES), steps)
-        self._offsets, self._shift_states, self._shift_inputs = grid(steps, nodes)
+        self._offsets, self._shift_states, self._shift_inputs = _grid(steps, nodes)
         self._qp = horizon_qp(task, params.kind, nodes)
         self.plan: Optimum | None = None
         self.disturbance: DisturbanceEstimator | None = None
-        self.counts = Counts()
+        self.counts = _Counts()
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         c = np.asarray(c, np.float64)
@@ -238,6 +238,28 @@ class NmpcController:
         """The last plan under TVLQR: the last solution, shifted, with the episode plan's gains."""
         gain = self._tracker.gains.k[self._step]
         return self._params.force_limit * self._guess_a[0] - gain @ (x - self._guess_x[0])
+
+
+def _grid(steps: int, nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`nodes` intervals N over a number of control steps: the first one step, the rest as equal as can be.
+
+    Returns:
+        How many control steps after now the nodes lie, (N+1,). What takes values at the nodes to the values one control step
+        later, linear between and constant beyond, (N+1, N+1). What takes values held over the intervals to their means one
+        control step later, 0 beyond the end, (N, N).
+
+    Raises:
+        ValueError: fewer than 2 nodes, or fewer control steps than nodes.
+    """
+    if not 2 <= nodes <= steps:
+        raise ValueError(f"a horizon of {steps} control steps takes 2 to {steps} nodes, not {nodes}")
+    base, longer = divmod(steps - 1, nodes - 1)
+    lengths = np.array([1] + [base] * (nodes - 1 - longer) + [base + 1] * longer)
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    of_states = np.array([np.interp(offsets + 1, offsets, unit) for unit in np.eye(nodes + 1)]).T
+    held = np.repeat(np.eye(nodes), lengths, axis=0)  # (steps, N)
+    later = np.vstack([held[1:], np.zeros((1, nodes))])
+    return offsets, of_states, np.add.reduceat(later, offsets[:-1], axis=0) / lengths[:, None]
 
 
 def offset_free_nmpc(task: Task, params: Robot) -> NmpcController:

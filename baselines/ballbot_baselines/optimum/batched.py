@@ -66,26 +66,27 @@ _FEW = 16  # problems
 _AT_ONCE = 256  # episodes in memory
 
 
-def solves(task: Task, params: Robot) -> bool:
-    """Whether `search_many` can solve this task here: C code can be compiled, it has all operations of the task, the task has
-    no clock, and the robot has `BATCHED_OPTIMA`.
+def search_many(
+    task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff
+) -> list[Optimum | None] | None:
+    """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
+
+    There is no list where episodes cannot be searched together: C code cannot be compiled here, it lacks an operation of the
+    task, the task has a clock, or the robot has wheels.
     """
+    if not _solves(task, params):
+        return None
+    backoff = replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal))
+    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(x0), _AT_ONCE)]
+    return [optimum for some in parts for optimum in _Batch(task, params, x0[some], c[some], backoff).optima()]
+
+
+def _solves(task: Task, params: Robot) -> bool:
     try:
         ilqr(task, params)
     except (machine_code.NoMachineCodeError, NotImplementedError, OSError):
         return False
     return True
-
-
-def search_many(task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff) -> list[Optimum | None]:
-    """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
-
-    Raises:
-        machine_code.NoMachineCodeError, NotImplementedError: the task is none that it `solves`.
-    """
-    backoff = replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal))
-    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(x0), _AT_ONCE)]
-    return [optimum for some in parts for optimum in _Batch(task, params, x0[some], c[some], backoff).optima()]
 
 
 class _Batch:

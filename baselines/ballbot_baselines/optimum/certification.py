@@ -51,10 +51,10 @@ def entries(
     """
     task, params, left = make_task(task, robot), checked_robot(robot), iter(indices)
     redrawn = None if params.grips or randomization.moves_optima else 1
-    at_once = not randomization.moves_optima and batched.solves(task, params)  # else each has another robot
     while some := list(itertools.islice(left, AT_ONCE)):
         x0, c = (np.array(part) for part in zip(*(episode(task, params, index) for index in some), strict=True))
-        second = batched.search_many(task, params, x0, c, Backoff()) if at_once else None
+        # where optima move, each episode has another robot
+        second = None if randomization.moves_optima else batched.search_many(task, params, x0, c, Backoff())
         for k, index in enumerate(some):
             found: EvaluationSet | str = ""
             twice = True if second is None else second[k] or False

@@ -75,8 +75,8 @@ def find_optimum(
         if any(solution.is_optimal for solution in found):
             break
     second = twice if isinstance(twice, Optimum) else None
-    if twice is True and batched.solves(task, params):
-        (second,) = batched.search_many(task, params, x0[None], c[None], backoff)
+    if twice is True:
+        (second,) = batched.search_many(task, params, x0[None], c[None], backoff) or [None]
     if second is not None:
         tried += _cheaper(episode, second, min((s.cost for s in tried if s.is_optimal), default=math.inf))
     within = [solution for solution in tried if solution.is_within_limits]
@@ -89,15 +89,10 @@ def find_optimum(
         )
     t = start + task.control_dt * np.arange(len(best.states))
     trajectory = Trajectory(t, best.states, params.force_limit * best.inputs)
-    return Optimum(
-        cost=best.cost,
-        trajectory=trajectory,
-        status="optimal" if best.is_optimal else "feasible",
-        solver_status=best.status,
-        violation=best.violation,
-        iterations=best.iterations,
-        solver=best.solver,
-        seconds=time.perf_counter() - started,
+    return Optimum.of(
+        best,
+        trajectory,
+        time.perf_counter() - started,
         slopes=best.slopes,
         markers=tuple(task.markers(c)),
         feedback=partial(tube_gains, task, params, trajectory, c),
@@ -138,8 +133,9 @@ def find_optima(
         if array.ndim != 2 or array.shape != (len(x0), width):
             count = "B" if name == "x0" else len(x0)
             raise ValueError(f"{name} must have the shape ({count}, {width}), not {array.shape}")
-    if batched.solves(task, params):
-        return batched.search_many(task, params, x0, c, backoff)
+    together = batched.search_many(task, params, x0, c, backoff)
+    if together is not None:
+        return together
     found: list[Optimum | None] = []
     for state, constants in zip(x0, c, strict=True):
         try:

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from ballbot_baselines.solvers.ocp import Solution
 from ballbot_gym.display import Moving
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
@@ -52,6 +53,21 @@ class Optimum(Moving):
     markers: tuple[Marker, ...] = ()
     feedback: Callable[[], np.ndarray] = _no_feedback
     """Computes `gains`, which takes as long as a part of the search; so it is called when they are first asked for."""
+
+    @classmethod
+    def of(cls, solution: Solution, trajectory: Trajectory, seconds: float, **more: Any) -> "Optimum":
+        """A solution of fatrop, ipopt or a simulation that is within its limits; `more` are further fields."""
+        return cls(
+            cost=solution.cost,
+            trajectory=trajectory,
+            status="optimal" if solution.is_optimal else "feasible",
+            solver_status=solution.status,
+            violation=solution.violation,
+            iterations=solution.iterations,
+            solver=solution.solver,
+            seconds=seconds,
+            **more,
+        )
 
     def facts(self) -> dict[str, str]:
         return {"cost": f"{self.cost:.4g}", "status": self.status, "found in": f"{self.seconds:.2f} s"}

@@ -29,7 +29,7 @@ _REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same contr
 
 
 @dataclass(frozen=True)
-class Prediction:
+class _Prediction:
     """What follows from every choice of sides, in B slaloms of n obstacles.
 
     | field | shape | meaning |
@@ -56,7 +56,7 @@ class Prediction:
 
 def predict(
     task: Task, params: Any, x0: np.ndarray, goal_y: np.ndarray, along: np.ndarray, obstacles: np.ndarray
-) -> Prediction:
+) -> _Prediction:
     """Predicts every choice of sides, in B slaloms at once.
 
     Args:
@@ -77,7 +77,7 @@ def predict(
     matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
     prices = _prices(matrices.reshape(-1, n, n), least.reshape(-1, n)).reshape(least.shape)
     costs = np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
-    return Prediction(sides, costs, passed, free, sides * prices, responses)
+    return _Prediction(sides, costs, passed, free, sides * prices, responses)
 
 
 @lru_cache(maxsize=8)

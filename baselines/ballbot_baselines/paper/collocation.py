@@ -14,14 +14,15 @@ variables q are states that do not change.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.solvers.ocp import ACCEPTABLE, Ocp, OcpSolver, Solution, no_path
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.solvers.ocp import ACCEPTABLE, Ocp, OcpSolver, Solution
 from ballbot_gym.robot import Ballbot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
@@ -47,42 +48,12 @@ class Problem:
     """Of |γ| and |θ|, rad."""
     periodic: bool = False
     """x_N = x_0."""
-    free: tuple[tuple[float, float], ...] = ()
-    """Bounds of further decision variables q."""
+    free: tuple[tuple[float, float, float], ...] = ()
+    """Lower bound, upper bound and guess of further decision variables q."""
     equalities: Callable[[Any, Any, Any], tuple] | None = None
     """(x, u, q) -> each 0, at knots 0 … N−1."""
     inequalities: Callable[[Any, Any, Any], tuple] | None = None
     """(x, u, q) -> each ≥ 0, at all knots."""
-
-
-@dataclass(frozen=True)
-class Guess:
-    """Where the solver starts: x (N+1, 8), u (N+1, 2), step h, s, and free variables q."""
-
-    x: np.ndarray
-    u: np.ndarray
-    h: float
-    q: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A solved `Problem`.
-
-    The trajectory has linear forces and cubic states. `violation` is the largest constraint violation. `collocation_error`
-    is the largest ∫|ẋ(t) − f(x(t), u(t))| dt over an interval, in state units, for the interpolated plan. It measures the
-    plan's error between knots, and shrinks as knots are added.
-    """
-
-    cost: float
-    trajectory: Trajectory
-    q: np.ndarray
-    status: str
-    violation: float
-    collocation_error: float
-    iterations: int
-    solver: str
-    seconds: float
 
 
 # Where things stand in the staged state s = [x, u/limit, h, q, x_start]. Only periodic problems have an x_start. Inputs are
@@ -116,11 +87,7 @@ def hermite_simpson(problem: Problem, params: Ballbot) -> Ocp:
         asked = path(problem.inequalities, s)
         return casadi.vertcat(asked, *params.limits(s[_X], limit * s[_A])) if params.grips else asked
 
-    initial = None
-    if problem.periodic:  # x_start is x_0
-        initial = np.zeros((8, start.stop))
-        initial[:, _X], initial[:, start] = np.eye(8), -np.eye(8)
-    return Ocp(
+    ocp = Ocp(
         name="hermite-simpson",
         states=start.stop,
         inputs=8,
@@ -129,17 +96,22 @@ def hermite_simpson(problem: Problem, params: Ballbot) -> Ocp:
         cost=lambda s, w, p: problem.cost(s[_X], limit * s[_A], s[_H], s[q]),
         equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(problem.equalities, s)),
         inequalities=lambda s, w, p: inequalities(s),
-        final_equalities=(lambda s, p: s[_X] - s[start]) if problem.periodic else no_path,
         final_inequalities=lambda s, p: inequalities(s),
-        initial_matrix=initial,
     )
+    if not problem.periodic:
+        return ocp
+    initial = np.zeros((8, start.stop))  # x_start is x_0
+    initial[:, _X], initial[:, start] = np.eye(8), -np.eye(8)
+    return replace(ocp, final_equalities=lambda s, p: s[_X] - s[start], initial_matrix=initial)
 
 
-def solve(problem: Problem, params: Ballbot, guess: Guess, solver: str = "ipopt", max_iterations: int = 500) -> Plan:
-    """Solves a problem from a guess, which should be roughly a motion.
+def solve(
+    problem: Problem, params: Ballbot, guess: Trajectory, solver: str = "ipopt", max_iterations: int = 500
+) -> Optimum:
+    """Solves a problem from a guess, which should be roughly a motion: its N+1 knots, at equal times, with linear forces.
 
-    From a straight line between two states the solvers take up to 12 times as many iterations, or stop at an infeasible
-    point.
+    The optimum's trajectory has linear forces and cubic states. From a straight line between two states the solvers take up
+    to 12 times as many iterations, or stop at an infeasible point.
 
     Raises:
         PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
@@ -148,7 +120,7 @@ def solve(problem: Problem, params: Ballbot, guess: Guess, solver: str = "ipopt"
     bounds = _bounds(problem, ocp)
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
-    constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
+    constant = np.tile([guess.t[1] - guess.t[0], *(value for _, _, value in problem.free), *start], (n + 1, 1))
     optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
     started = time.perf_counter()
     result = optimizer.solve(np.hstack([knots, constant]), knots[1:, _INPUTS], *bounds)
@@ -159,7 +131,7 @@ def solve(problem: Problem, params: Ballbot, guess: Guess, solver: str = "ipopt"
             f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
             f"violated by {result.violation:.1e}. Try another guess or more time."
         )
-    return _plan(problem, params, result, seconds)
+    return _optimum(params, result, seconds)
 
 
 def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +143,7 @@ def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
         upper[knot, _X] = np.minimum(upper[knot, _X], high)
     # h and q do not change, so bounds at the first knot suffice.
     lower[0, _H], upper[0, _H] = problem.step
-    for i, (low, high) in enumerate(problem.free):
+    for i, (low, high, _) in enumerate(problem.free):
         lower[0, _H + 1 + i], upper[0, _H + 1 + i] = low, high
     for knot, i in np.argwhere(lower > upper)[:1]:
         name, low, high = Ballbot.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
@@ -181,25 +153,18 @@ def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def _plan(problem: Problem, params: Ballbot, result: Solution, seconds: float) -> Plan:
+def _optimum(params: Ballbot, result: Solution, seconds: float) -> Optimum:
     x, u = result.states[:, _X], params.force_limit * result.states[:, _A]
     t = result.states[0, _H] * np.arange(len(x))
     trajectory = Trajectory(t, x, u, xdot=params.derivative(x, u))
-    return Plan(
-        cost=result.cost,
-        trajectory=trajectory,
-        q=result.states[0, _free(problem)],
-        status=result.status,
-        violation=result.violation,
-        collocation_error=collocation_error(params, trajectory),
-        iterations=result.iterations,
-        solver=result.solver,
-        seconds=seconds,
-    )
+    return Optimum.of(result, trajectory, seconds, slopes=np.full(x.shape, np.nan))
 
 
 def collocation_error(params: Ballbot, trajectory: Trajectory) -> float:
-    """The largest ∫|ẋ − f(x, u)| dt over an interval and a state component, for x cubic and u linear between knots."""
+    """The largest ∫|ẋ − f(x, u)| dt over an interval and a state component, for x cubic and u linear between knots.
+
+    It measures a plan's error between knots, in state units, and shrinks as knots are added.
+    """
     t, u = trajectory.t, trajectory.u
     step = np.diff(t)
     inner = (t[:-1, None] + step[:, None] * _INTERIOR).ravel()

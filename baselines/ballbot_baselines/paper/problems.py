@@ -14,7 +14,8 @@ import numpy as np
 from ballbot_baselines.feedback.lqr import LqrController
 from ballbot_baselines.feedback.trajopt import TrajoptController
 from ballbot_baselines.feedback.tvlqr import TvlqrController
-from ballbot_baselines.paper.collocation import Guess, Plan, Problem, solve
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.paper.collocation import Problem, solve
 from ballbot_baselines.solvers.guess import along_path
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import ops
@@ -50,11 +51,11 @@ class PaperProblem:
     title: str
     figure: str
     problem: Problem
-    guess: Callable[[Ballbot], Guess]
+    guess: Callable[[Ballbot], Trajectory]
     obstacles: tuple[tuple[float, float, float], ...] = ()
     """x, y and the distance that the ball's centre keeps, m."""
 
-    def solve(self, params: Ballbot, solver: str = "ipopt") -> Plan:
+    def solve(self, params: Ballbot, solver: str = "ipopt") -> Optimum:
         """The optimum.
 
         Raises:
@@ -96,8 +97,10 @@ def between_states(
     )
 
 
-def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Problem:
-    """The paper's optimization 2: a closed circle of free radius q[0] at constant ground speed, m/s, from (0, y ≥ 0)."""
+def _circular_orbit(name: str, speed: float, radius: float, intervals: int = INTERVALS) -> Problem:
+    """The paper's optimization 2: a closed circle at constant ground speed, m/s, from (0, y ≥ 0). Its radius q[0] is free;
+    the guess of it is `radius`, m.
+    """
 
     def cost(x: ops.Vector, u: ops.Vector, h: float, q: ops.Vector) -> float:
         px, py, *_ = ops.components(x)
@@ -119,36 +122,36 @@ def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Probl
         intervals=intervals,
         lean_limit=LEAN_LIMIT,
         periodic=True,
-        free=((0.1, 10.0),),
+        free=((0.1, 10.0, radius),),
         equalities=on_circle,
     )
 
 
 def hermite_guess(
     params: Ballbot, x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int = INTERVALS
-) -> Guess:
+) -> Trajectory:
     """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces; duration in s."""
     path = cubic(x0[:2], x0[4:6], x1[:2], x1[4:6], intervals, duration / intervals)
     return _along(params, path, x0, x1, duration)
 
 
-def _along(params: Ballbot, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
+def _along(params: Ballbot, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Trajectory:
     """Zero forces, and states along a ground path (intervals+1, 2), m, from x0 to x1."""
     h = duration / (len(path) - 1)
     x, _ = along_path(params, path, h)
     x[0], x[-1] = x0, x1
-    return Guess(x, np.zeros((len(path), 2)), h)
+    return Trajectory(h * np.arange(len(path)), x, np.zeros((len(path), 2)))
 
 
-def _orbit_guess(params: Ballbot, speed: float, radius: float) -> Guess:
+def _orbit_guess(params: Ballbot, speed: float, radius: float) -> Trajectory:
     bearings = np.pi / 2 + np.linspace(0, 2 * np.pi, INTERVALS + 1)
     x, u = steady_orbit(params, radius, speed, bearings)
-    return Guess(x, u, 2 * np.pi * radius / speed / INTERVALS, (radius,))
+    return Trajectory(2 * np.pi * radius / speed / INTERVALS * np.arange(len(x)), x, u)
 
 
 def _weave_guess(
     params: Ballbot, x0: np.ndarray, x1: np.ndarray, via: tuple[tuple[float, float], ...], duration: float
-) -> Guess:
+) -> Trajectory:
     """A spline that passes each obstacle on a chosen side, leans from its accelerations, zero forces."""
     from scipy.interpolate import CubicSpline
 
@@ -182,7 +185,7 @@ def _turn(speed: float, figure: str, duration: float) -> PaperProblem:
 
 
 def _orbit(speed: float, figure: str, radius: float) -> PaperProblem:
-    problem = circular_orbit(f"orbit-{speed:g}", speed)
+    problem = _circular_orbit(f"orbit-{speed:g}", speed, radius)
     guess = partial(_orbit_guess, speed=speed, radius=radius)
     return PaperProblem(f"Circular orbit at {speed:g} m/s", figure, problem, guess)
 
@@ -215,7 +218,7 @@ PAPER_PROBLEMS: dict[str, PaperProblem] = {
 """The paper's experiments by name."""
 
 
-def track_plan(plan: Plan, params: Ballbot) -> tuple[Trajectory, float]:
+def track_plan(plan: Optimum, params: Ballbot) -> tuple[Trajectory, float]:
     """A plan's execution under TVLQR, in PyBullet where it is installed, with the weights of the paper's cost.
 
     Returns:

@@ -41,7 +41,7 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
     generator = casadi.CodeGenerator("stage.c")
     for function in functions:
         generator.add(function)
-    return loaded(name, generator.dump(), functions, ("-O2",)) or functions
+    return _loaded(name, generator.dump(), functions, ("-O2",)) or functions
 
 
 def in_lanes(
@@ -55,7 +55,7 @@ def in_lanes(
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
     try:
-        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, flags)
+        found = _loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, flags)
     except NotImplementedError:  # an operation that only CasADi knows as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)
@@ -87,7 +87,7 @@ class InPlace:
         return bool(self._buffer.stats()["success"])
 
 
-def loaded(
+def _loaded(
     name: str, source: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...]
 ) -> tuple[casadi.Function, ...] | None:
     """The functions of a library of C code; None where there is none."""

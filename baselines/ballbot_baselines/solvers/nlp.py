@@ -3,7 +3,7 @@
     minimize    f(z) = Σ_{k<N} cost(s_k, w_k, p) + final_cost(s_N, p)
     subject to  g(z) = 0 or ≥ 0
 
-Everything is a map of stage functions over the stages. `Stage` differentiates the functions of one stage, and `StagedNlp`
+Everything is a map of stage functions over the stages. `_Stage` differentiates the functions of one stage, and `StagedNlp`
 puts the nonzeros of all stages in their places.
 
 Variables z:
@@ -24,15 +24,14 @@ Constraints g, in the order that fatrop needs:
 """
 
 import itertools
-from typing import NamedTuple
 
 import casadi
 import numpy as np
 
-from ballbot_baselines.solvers.compiled import LANES, SIMD, compiled, in_lanes
+from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, compiled, in_lanes
 
 
-class Stage:
+class _Stage:
     """A vector function out(z, p) of one stage, with the nonzeros of its Jacobian and of its Lagrangian's Hessian.
 
     A function takes the parameters up to the last one that it depends on. So problems that differ only in the others share
@@ -70,7 +69,7 @@ _AHEAD, _SHARE = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 """Of RK4's four evaluations: how far ahead in a step, and the share of their rates in it."""
 
 
-class RatesStage(Stage):
+class _RatesStage(_Stage):
     """A stage whose result is the state after RK4 steps of given rates, for rates of so many operations that the steps and
     their derivatives, written out, would take minutes to compile.
 
@@ -120,20 +119,52 @@ class RatesStage(Stage):
         self.jacobian_at, self.hessian_at = (casadi.Sparsity.dense(rows, width) for rows in (n, width))
 
 
-class Stages(NamedTuple):
-    """What a program of any horizon is made of; see `ocp.Ocp`."""
+class Stages:
+    """What a program of any horizon is made of; see `ocp.Ocp`.
 
-    dynamics: Stage
-    """Next state of [s, w]."""
-    running: Stage
-    """[cost, equalities, inequalities] of [s, w]."""
-    final: Stage
-    """The same of the end, of s."""
-    equalities: int
-    final_equalities: int
-    params: int
-    """Length of p."""
-    initial_matrix: np.ndarray
+    | attribute | meaning |
+    |---|---|
+    | `dynamics` | the next state of [s, w] |
+    | `running` | [cost, equalities, inequalities] of [s, w] |
+    | `final` | the same of the end, of s |
+    | `equalities`, `final_equalities` | how many there are |
+    | `params` | length of p |
+    | `initial_matrix` | as in `ocp.Ocp` |
+    """
+
+    def __init__(
+        self,
+        name: str,
+        variables: tuple[casadi.SX, casadi.SX, casadi.SX],
+        moves: tuple[casadi.SX, int],
+        running: tuple[casadi.SX, casadi.SX, casadi.SX],
+        final: tuple[casadi.SX, casadi.SX, casadi.SX],
+        params: int,
+        initial_matrix: np.ndarray,
+    ):
+        """Differentiates the functions of a stage, and compiles them on first use on a machine.
+
+        Args:
+            name: what the compiled functions are called, for humans who look into the cache.
+            variables: s, w and p.
+            moves: the next state and 0; or rates of the state, and the number of RK4 steps that integrate them over a
+                time of 1.
+            running: cost, equalities and inequalities.
+            final: the same of the end.
+            params: length of p without the number of the stage.
+            initial_matrix: as in `ocp.Ocp`.
+        """
+        s, w, p = variables
+        z, (move, steps) = casadi.vertcat(s, w), moves
+        move, costs, final_costs = (
+            casadi.densify(each) for each in (move, casadi.vertcat(*running), casadi.vertcat(*final))
+        )
+        flags = LONG if steps else SIMD
+        self.dynamics = _RatesStage(z, p, move, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
+        self.running = _Stage(name, z, p, costs, of_stages=True, flags=flags)
+        self.final = _Stage(f"{name}-final", s, p, final_costs, of_stages=False)
+        self.equalities, self.final_equalities = running[1].shape[0], final[1].shape[0]
+        self.params, self.initial_matrix = params, initial_matrix
 
 
 class StagedNlp:
@@ -143,7 +174,9 @@ class StagedNlp:
     """
 
     def __init__(self, stages: Stages, intervals: int):
-        dynamics, running, final, equalities, final_equalities, params, initial_matrix = stages
+        dynamics, running, final = stages.dynamics, stages.running, stages.final
+        equalities, final_equalities = stages.equalities, stages.final_equalities
+        initial_matrix, params = stages.initial_matrix, stages.params
         self._dynamics, self._running, self._final, self._initial = dynamics, running, final, casadi.DM(initial_matrix)
         self._n, self._states, self._width = n, states, width = intervals, dynamics.size, dynamics.width
         # Results stand kind by kind: gaps of all stages, [cost, path] of all stages and of the end, and initial rows. Those
@@ -265,7 +298,7 @@ class StagedNlp:
             casadi.diagcat(sum(of_stages), casadi.MX(self._final.hessian_at, final_hessian)),
         )
 
-    def _over_stages(self, stage: Stage, function: casadi.Function, *multipliers: casadi.MX) -> list[casadi.MX]:
+    def _over_stages(self, stage: _Stage, function: casadi.Function, *multipliers: casadi.MX) -> list[casadi.MX]:
         """Results of all stages, a column each. The last block of stages is filled up with the last stage."""
         blocks = -(-self._n // LANES)
         last = [self._n - 1] * (blocks * LANES - self._n)

@@ -11,14 +11,16 @@ once (`compiled.py`). So time and memory grow linearly with N.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import casadi
 import numpy as np
 
-from ballbot_baselines.solvers.compiled import LONG, SIMD
-from ballbot_baselines.solvers.nlp import RatesStage, Stage, StagedNlp, Stages
+from ballbot_baselines.solvers.nlp import StagedNlp, Stages
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
@@ -31,7 +33,7 @@ ACCEPTABLE = "Solved_To_Acceptable_Level"
 """The status of ipopt where it stopped early, at its acceptable tolerance."""
 
 
-def no_path(*arguments: casadi.SX) -> casadi.SX:
+def _no_path(*arguments: casadi.SX) -> casadi.SX:
     """No constraint."""
     return casadi.SX(0, 1)
 
@@ -48,20 +50,20 @@ class Ocp:
     """(s, w, p) -> (states,)."""
     cost: StageFunction
     """(s, w, p) -> scalar."""
-    equalities: StageFunction = no_path
+    equalities: StageFunction = _no_path
     """(s, w, p) -> (ne,), each 0."""
-    inequalities: StageFunction = no_path
+    inequalities: StageFunction = _no_path
     """(s, w, p) -> (ni,), each ≥ 0."""
     final_cost: FinalFunction = lambda s, p: casadi.SX(0)
     """(s, p) -> scalar."""
-    final_equalities: FinalFunction = no_path
+    final_equalities: FinalFunction = _no_path
     """(s, p) -> (me,), each 0."""
-    final_inequalities: FinalFunction = no_path
+    final_inequalities: FinalFunction = _no_path
     """(s, p) -> (mi,), each ≥ 0."""
     counts_stages: bool = False
     """Whether p of every function has one entry more, at its end: the stage's number k, and N at the end."""
     rates: StageFunction | None = None
-    """(s, w, p) -> (states,) where `next` is `rk4_steps` RK4 steps of these over a time of 1; see `nlp.RatesStage`."""
+    """(s, w, p) -> (states,) where `next` is `rk4_steps` RK4 steps of these over a time of 1; see `nlp.Stages`."""
     rk4_steps: int = 1
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
@@ -71,20 +73,13 @@ class Ocp:
         """The stage functions with their derivatives, made once for solvers of every horizon."""
         params = self.params + self.counts_stages
         s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", self.states), ("w", self.inputs), ("p", params)))
-        equal, final_equal = self.equalities(s, w, p), self.final_equalities(s, p)
-        z, path = casadi.vertcat(s, w), casadi.vertcat(equal, self.inequalities(s, w, p))
-        final_path = casadi.vertcat(final_equal, self.final_inequalities(s, p))
-        costs, final_costs = casadi.vertcat(self.cost(s, w, p), path), casadi.vertcat(self.final_cost(s, p), final_path)
-        if self.rates is None:
-            dynamics = Stage("dynamics", z, p, casadi.densify(casadi.SX(self.next(s, w, p))), of_stages=True)
-        else:
-            dynamics = RatesStage(z, p, casadi.densify(self.rates(s, w, p)), self.rk4_steps)
+        moves = (casadi.SX(self.next(s, w, p)), 0) if self.rates is None else (self.rates(s, w, p), self.rk4_steps)
         return Stages(
-            dynamics=dynamics,
-            running=Stage(self.name, z, p, casadi.densify(costs), of_stages=True, flags=LONG if self.rates else SIMD),
-            final=Stage(f"{self.name}-final", s, p, casadi.densify(final_costs), of_stages=False),
-            equalities=equal.shape[0],
-            final_equalities=final_equal.shape[0],
+            self.name,
+            (s, w, p),
+            moves,
+            running=(self.cost(s, w, p), self.equalities(s, w, p), self.inequalities(s, w, p)),
+            final=(self.final_cost(s, p), self.final_equalities(s, p), self.final_inequalities(s, p)),
             params=self.params,
             initial_matrix=np.zeros((0, self.states)) if self.initial_matrix is None else self.initial_matrix,
         )
@@ -199,14 +194,15 @@ class OcpSolver:
         p = np.asarray(p, np.float64)
         lower, upper = (bound.ravel()[: -self.ocp.inputs] for bound in (lower, upper))
         guess = np.concatenate([np.hstack([states[:-1], inputs]).ravel(), states[-1]])
-        result = self._nlpsol(
-            x0=np.clip(guess, lower, upper),
-            p=p,
-            lbx=lower,
-            ubx=upper,
-            lbg=self._g_lower,
-            ubg=self._g_upper,
-        )
+        with _interrupts_kept():
+            result = self._nlpsol(
+                x0=np.clip(guess, lower, upper),
+                p=p,
+                lbx=lower,
+                ubx=upper,
+                lbg=self._g_lower,
+                ubg=self._g_upper,
+            )
         stats = self._nlpsol.stats()
         status = _status(self.solver, stats)
         z = np.array(result["x"]).ravel()
@@ -236,3 +232,34 @@ def _status(solver: str, stats: dict) -> str:
     if solver == "ipopt":
         return str(stats["return_status"])
     return SUCCEEDED if stats["success"] else f"fatrop stopped ({stats['unified_return_status']})"
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """Raises a KeyboardInterrupt at the end of the block if one came within it.
+
+    CasADi prints it and goes on, so that a command would not end, and an interrupted search would pass for one that failed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    raised: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in handlers.items() if callable(handler)}
+
+    def on_signal(number: int, frame: object) -> None:
+        try:
+            before[signal.Signals(number)](number, frame)  # pyright: ignore[reportArgumentType]
+        except KeyboardInterrupt:
+            raised.append(number)
+            raise
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if raised:
+            raise KeyboardInterrupt

@@ -4,7 +4,7 @@ All use the env's own discretization: force held for control_dt, cost summed ove
 cost of an endless episode is xᵀPx.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -101,7 +101,28 @@ def tracking_gains(
     return _riccati(*_steps(task, params, x, u, c, start), p_final)
 
 
-def closed_gains(task: Task, params: Robot, reference: Reference, c: np.ndarray) -> Gains:
+def reference_gains(
+    task: Task, params: Robot, reference: Reference, c: np.ndarray, start: float = 0.0
+) -> tuple[Reference, Gains]:
+    """LQR about a reference motion, with a gain for each of its points.
+
+    Around a closed motion the gains are periodic. A task with a clock gives an open reference that may be no motion of the
+    robot, so forces that look ahead are added to it (`_feedforward`). The first point is at the episode's time `start`, s.
+
+    Raises:
+        PlanError: there is no gain.
+    """
+    if reference.closed:
+        return reference, _closed_gains(task, params, reference, c)
+    end = start + task.control_dt * len(reference.x)
+    _, p_final = lqr_at_end(task, params, reference.x[-1], c, end)
+    gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, start)
+    if task.clock:
+        reference = replace(reference, u=reference.u + _feedforward(task, params, reference, c, gains, start))
+    return reference, gains
+
+
+def _closed_gains(task: Task, params: Robot, reference: Reference, c: np.ndarray) -> Gains:
     """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
     steps, after = _steps(task, params, reference.x, reference.u, c), np.eye(reference.x.shape[1])
     for _ in range(_MAX_ROUNDS):
@@ -121,7 +142,7 @@ def _steps(
     return *discretize(params, x, u, dt), q * dt, r * dt
 
 
-def feedforward(
+def _feedforward(
     task: Task, params: Robot, reference: Reference, c: np.ndarray, gains: Gains, start: float = 0.0
 ) -> np.ndarray:
     """(n, 2) forces, N, to add along an open reference that is no motion of the robot, or not the cheapest near it.

@@ -4,8 +4,8 @@ No controller knows of the disturbance: experts plan for the nominal robot with 
 meets the same draws. Under a stress, regret is measured against the undisturbed optimum, so no controller could avoid all of
 it.
 
-The tracks of `ballbot_gym.randomization` are robots that nobody told. Every episode has an optimum of its own there: that of
-its robot, whose first forces are none while its delay lasts. Who reaches it would have to know what was drawn. In units of
+The tracks of `ballbot_gym.robot.randomization` are unknown robots. Every episode has an optimum of its own there: that of its
+robot, whose first forces are none while its delay lasts. Who reaches it would have to know what was drawn. In units of
 that optimum J, regret splits into what adds up:
 
 - what not knowing costs: how far the best controller of the table is from J in the same episode,
@@ -23,9 +23,9 @@ import numpy as np
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, TRACKS, Randomization
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.benchmark import Group
 from ballbot_train.evaluation.results import Result, Row, leaderboard, shown
-from ballbot_train.policy_files import track_in
+from ballbot_train.evaluation.runner import Group
+from ballbot_train.policy.files import track_in
 
 
 @dataclass(frozen=True)

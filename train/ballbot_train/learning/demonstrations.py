@@ -39,19 +39,19 @@ from minari.dataset.minari_dataset import parse_dataset_id
 
 from ballbot_baselines import CONTROLLERS, Backoff
 from ballbot_baselines.feedback.trajopt import EXECUTED
-from ballbot_gym import seeding
+from ballbot_gym import certified, files, seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.identity import digest, named_problem
 from ballbot_gym.robot import PAPER, Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_train import jobs, shards
-from ballbot_train.console import check_names
 from ballbot_train.evaluation import controllers
-from ballbot_train.executors import Workers
 from ballbot_train.learning.datasets import IN_DATASET, metadata_of
-from ballbot_train.policy_files import OBSERVATION_VERSION
+from ballbot_train.policy.files import OBSERVATION_VERSION
+from ballbot_train.work import jobs, shards
+from ballbot_train.work.console import check_names
+from ballbot_train.work.executors import Workers
 
 _LONGER = ("observations", "states")  # than the others by one, of an episode
 _MOST_EPISODES = 1_000_000
@@ -335,6 +335,7 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
             description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
             requirements=[f"ballbot-gym>={importlib.metadata.version('ballbot-gym')}"],
             data_format="hdf5",
+            **_scores(task, config.robot),
         )
     dataset.storage.update_episode_metadata(about)
     dataset.storage.update_metadata(
@@ -346,6 +347,12 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
         }
     )
     (root / out.name).rename(out)
+
+
+def _scores(task: Task, robot: str) -> dict[str, float]:
+    """Mean returns of random actions and of the optima, by which Minari normalizes scores; of the shipped tasks alone."""
+    path = Path(certified.__file__).with_name("scores.json")
+    return files.read_json(path).get(task.id, {}) if robot == PAPER else {}
 
 
 def _buffers(arrays: Mapping[str, np.ndarray]) -> Iterator[EpisodeBuffer]:
