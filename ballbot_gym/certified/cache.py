@@ -90,7 +90,8 @@ def _digest(task: Task, params: Robot, randomization: Randomization) -> str:
     for index in range(2):
         x, c = episode(task, params, index)
         paths = [np.round(path, 9).tolist() for path in task.guess_paths(x, c, params)]
-        parts.append(json.dumps([x.tolist(), c.tolist(), paths]))
+        guesses = [] if paths else [np.round(states, 9).tolist() for states, _ in task.guesses(x, c, params)]
+        parts.append(json.dumps([x.tolist(), c.tolist(), paths, *guesses]))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 

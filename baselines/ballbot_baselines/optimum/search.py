@@ -44,6 +44,9 @@ def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) ->
     """
     task, x0, c, params = episode.task, episode.x0, episode.c, episode.params
     paths = task.guess_paths(x0, c, params) if given is None else given
+    if not paths:
+        yield _from_states(episode, task.guesses(x0, c, params)[:guesses])
+        return
     likely = given is None and guesses > 1 and task.steps % COARSE == 0
     obstacles = task.passed_obstacles(c) if likely else None
     if obstacles is not None:
@@ -59,6 +62,18 @@ def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) ->
     if alone:
         yield _quickly(episode, paths[0], _HIGH_BARRIER)
         yield _from_paths(episode, paths)
+
+
+def _from_states(episode: Shooting, guesses: list[tuple[np.ndarray, np.ndarray]]) -> list[Solution]:
+    """Every solution found from guessed states and actions."""
+    task, limit, found = episode.task, episode.params.force_limit, list[Solution]()
+    for x, u in guesses:
+        if task.first_exit:
+            relaxed = episode.relaxed(x, u / limit, task.control_dt)
+            found += episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
+        else:
+            found += episode.solve_to_the_end(x, u / limit, near=False)
+    return found
 
 
 def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[Solution]:
