@@ -34,7 +34,6 @@ from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, checked_randomization
-
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.sensors import check_observation, observation_space
 from ballbot_gym.tasks import Task

@@ -11,7 +11,10 @@ once (`compiled.py`). So time and memory grow linearly with N.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import casadi
@@ -191,14 +194,15 @@ class OcpSolver:
         p = np.asarray(p, np.float64)
         lower, upper = (bound.ravel()[: -self.ocp.inputs] for bound in (lower, upper))
         guess = np.concatenate([np.hstack([states[:-1], inputs]).ravel(), states[-1]])
-        result = self._nlpsol(
-            x0=np.clip(guess, lower, upper),
-            p=p,
-            lbx=lower,
-            ubx=upper,
-            lbg=self._g_lower,
-            ubg=self._g_upper,
-        )
+        with _interrupts_kept():
+            result = self._nlpsol(
+                x0=np.clip(guess, lower, upper),
+                p=p,
+                lbx=lower,
+                ubx=upper,
+                lbg=self._g_lower,
+                ubg=self._g_upper,
+            )
         stats = self._nlpsol.stats()
         status = _status(self.solver, stats)
         z = np.array(result["x"]).ravel()
@@ -228,3 +232,34 @@ def _status(solver: str, stats: dict) -> str:
     if solver == "ipopt":
         return str(stats["return_status"])
     return SUCCEEDED if stats["success"] else f"fatrop stopped ({stats['unified_return_status']})"
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """Raises a KeyboardInterrupt at the end of the block if one came within it.
+
+    CasADi prints it and goes on, so that a command would not end, and an interrupted search would pass for one that failed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    raised: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in handlers.items() if callable(handler)}
+
+    def on_signal(number: int, frame: object) -> None:
+        try:
+            before[signal.Signals(number)](number, frame)  # pyright: ignore[reportArgumentType]
+        except KeyboardInterrupt:
+            raised.append(number)
+            raise
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if raised:
+            raise KeyboardInterrupt
