@@ -8,7 +8,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.display import Moving
 from ballbot_gym.paths import hermite_basis
-from ballbot_gym.robot import tilt
+from ballbot_gym.robot import Ballbot, tilt
 
 MAX_SAMPLES = 1_000_000
 """Times that `Trajectory.resampled` gives at most."""
@@ -20,11 +20,11 @@ class TrajectoryError(ValueError):
 
 @dataclass(frozen=True, repr=False)
 class Trajectory(Moving):
-    """States at increasing times, with the forces between them.
+    """States at increasing times, with what the actuators apply between them.
 
-    t: (N+1,) s. x: (N+1, 8); order and units in `Ballbot.STATE`. u: (N, 2) N where each force is held until the next
-    time, or (N+1, 2) where it runs linearly between times. xdot: (N+1, 8) slopes of x, if known: with them x is
-    interpolated by cubics, else linearly. Of a robot with wheels x is (N+1, 11), and u has three columns.
+    t: (N+1,) s. x: (N+1, n); order and units in the robot's `STATE`. u: (N, m), as `ACTION` names it, where each is held
+    until the next time, or (N+1, m) where it runs linearly between times. xdot: (N+1, n) slopes of x, if known: with them
+    x is interpolated by cubics, else linearly.
 
     Raises:
         TrajectoryError: shapes that do not fit, times that do not increase, or values that are not finite.
@@ -44,11 +44,10 @@ class Trajectory(Moving):
                 except ValueError as error:
                     raise TrajectoryError(str(error)) from None
         n = self.t.size - 1
-        if n < 0 or self.t.shape != (n + 1,) or self.x.shape not in ((n + 1, 8), (n + 1, 11)):
-            raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, 8)")
-        forces = 2 if self.x.shape[1] == 8 else 3
-        if self.u.shape not in ((n, forces), (n + 1, forces)):
-            raise TrajectoryError(f"u {self.u.shape} must be ({n}, {forces}), held, or ({n + 1}, {forces}), linear")
+        if n < 0 or self.t.shape != (n + 1,) or self.x.ndim != 2 or len(self.x) != n + 1 or not self.x.shape[1]:
+            raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, n)")
+        if self.u.ndim != 2 or len(self.u) not in (n, n + 1) or not self.u.shape[1]:
+            raise TrajectoryError(f"u {self.u.shape} must be ({n}, m), held, or ({n + 1}, m), linear")
         if self.xdot is not None and self.xdot.shape != self.x.shape:
             raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
         if not (np.diff(self.t) > 0).all():
@@ -60,13 +59,16 @@ class Trajectory(Moving):
         return self
 
     def facts(self) -> dict[str, str]:
-        return {
-            "duration": f"{self.duration:.2f} s",
-            "states": f"{len(self.t)}",
-            "peak tilt": f"{np.degrees(self.tilt.max()):.1f}°",
-            "peak speed": f"{np.hypot(self.x[:, 4], self.x[:, 5]).max():.2f} m/s",
-            "peak force": f"{np.linalg.norm(self.u, axis=1).max(initial=0.0):.0f} N",
-        }
+        facts = {"duration": f"{self.duration:.2f} s", "states": f"{len(self.t)}"}
+        if self.is_of_ballbot:
+            facts["peak tilt"] = f"{np.degrees(self.tilt.max()):.1f}°"
+            facts["peak speed"] = f"{np.hypot(self.x[:, 4], self.x[:, 5]).max():.2f} m/s"
+        return facts | {"peak force": f"{np.linalg.norm(self.u, axis=1).max(initial=0.0):.0f} N"}
+
+    @property
+    def is_of_ballbot(self) -> bool:
+        """Whether states begin with the eight components of `Ballbot.STATE`, and actions are two or three forces."""
+        return self.x.shape[1] >= len(Ballbot.STATE) and self.u.shape[1] in (2, 3)
 
     @property
     def duration(self) -> float:
@@ -80,8 +82,8 @@ class Trajectory(Moving):
 
     @property
     def tilt(self) -> np.ndarray:
-        """(N+1,) angle between the body's axis and the vertical, rad."""
-        return tilt(self.x)
+        """(N+1,) angle between the body's axis and the vertical, rad; NaN of robots other than ballbots."""
+        return tilt(self.x) if self.is_of_ballbot else np.full(len(self.x), np.nan)
 
     def state(self, t: float) -> np.ndarray:
         """x(t), (8,). Before the start it is the first state, after the end the last one."""

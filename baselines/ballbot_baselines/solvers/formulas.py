@@ -10,7 +10,7 @@ from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
 _SEGMENTS, _POINTS = 32, 401  # straight lines through states near starts, and points of each
-_REACH = np.array([2.0, 2.0, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0])  # how far lines lead from starts, SI units
+_REACH, _TURN = 2.0, 0.5  # how far lines lead from starts, SI units; and of angles, rad
 _SMOOTH = 1e-3  # of its range: how much a quantity may differ from the integral of its slope, between two points
 _ADVICE = (
     "Compute with + - * / ** and the functions of ballbot_gym.ops on ops.components of x, u and c; not with if, float() "
@@ -27,7 +27,7 @@ def check_formulas(task: Task, params: Robot) -> None:
     rng = np.random.default_rng(0)
     starts = [task.sample(rng, params) for _ in range(_SEGMENTS)]
     x = np.stack([x for x, _ in starts])
-    towards = rng.uniform(-1, 1, x.shape) * np.concatenate([_REACH, np.ones(x.shape[1] - 8)])
+    towards = rng.uniform(-1, 1, x.shape) * [_TURN if each.unit == "rad" else _REACH for each in params.STATE]
     u = rng.uniform(-1, 1, (_SEGMENTS, params.action_size)) * params.force_limit
     at_times = rng.uniform(0, task.duration, _SEGMENTS)
     c = np.stack([task.at(c, np.float64(t)) for (_, c), t in zip(starts, at_times, strict=True)])
