@@ -42,13 +42,31 @@ def check_methods(task: Task, params: Robot, x: np.ndarray, c: np.ndarray, where
 
 def check_paths(task: Task, params: Robot, x: np.ndarray, c: np.ndarray, where: str) -> None:
     """Raises a ValueError where a task guesses no path from a state x (8,), or none that an optimizer can take."""
-    paths, kind = task.guess_paths(x, c, params), type(task).__name__
+    kind = type(task).__name__
+    if type(task).guess_paths is Task.guess_paths:
+        _check_guesses(kind, task.guesses(x, c, params), params, where)
+        return
+    paths = task.guess_paths(x, c, params)
     if not isinstance(paths, list | tuple | np.ndarray) or not len(paths):
         raise ValueError(f"{kind}.guess_paths gives {paths!r} {where}; give a list with at least one path")
     for path in paths:
         if np.shape(path)[1:] != (2,) or len(path) < 2 or not np.isfinite(path).all():
             raise ValueError(
                 f"{kind}.guess_paths gives the shape {np.shape(path)} {where}; give finite (n+1, 2) positions, m"
+            )
+
+
+def _check_guesses(kind: str, guesses: Any, params: Robot, where: str) -> None:
+    if not isinstance(guesses, list | tuple) or not guesses:
+        raise ValueError(
+            f"{kind}.guesses gives {guesses!r} {where}; give a list with at least one pair of states and actions"
+        )
+    for states, actions in guesses:
+        n, sizes = len(actions), (params.state_size, params.action_size)
+        if np.shape(states) != (n + 1, sizes[0]) or np.shape(actions) != (n, sizes[1]) or not n:
+            raise ValueError(
+                f"{kind}.guesses gives the shapes {np.shape(states)} and {np.shape(actions)} {where}; give states "
+                f"(n+1, {sizes[0]}) and actions (n, {sizes[1]})"
             )
 
 

@@ -35,7 +35,7 @@ def basins(
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
     chosen = controllers_of([maps.TASK], controllers, robot)
-    physics = physics_or_default(physics)
+    physics = physics_or_default(physics, robot)
     names = chosen[maps.TASK]
     facts = open_run(out, workers, {robot: chosen}, robot, physics=physics, points=points)
     ways = facts.get("trained_by", {})

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import certified, files
-from ballbot_gym.robot import PAPER, checked_randomization
+from ballbot_gym.robot import PAPER, Ballbot, checked_randomization, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.evaluation import robustness
@@ -53,7 +53,7 @@ def benchmark(
             with the experts that are made for each track.
     """
     chosen = controllers_of(tasks, controllers, robot, tracks=bool(randomization))
-    physics = physics_or_default(physics)
+    physics = physics_or_default(physics, robot)
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:
         for track in randomization:
@@ -81,11 +81,12 @@ def benchmark(
         kept = certified.load(task, robot, episodes=range(episode + 1)).trajectories  # of the first episodes
         optimum = [Take("optimum", each, "0.35", style="--") for each in kept[episode : episode + 1]]
         takes = [*optimum, *replays[-1].takes]
-        figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers)
+        figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers, named_robot(robot))
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    report = report_page(title, replays, HEADER, table_cells(TABLE, rows, ways), shown, facts)
+    drawn = replays if isinstance(named_robot(robot), Ballbot) else []  # the page draws ballbots
+    report = report_page(title, drawn, HEADER, table_cells(TABLE, rows, ways), shown, facts)
     page = files.write(out / "report.html", report)
     publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows, facts)
     for result in done:

@@ -83,7 +83,7 @@ def evaluate(
         return
     if optima:
         raise ValueError("the optima of certified episodes are known; give --optima with --fresh")
-    engine, count = physics_or_default(physics), checked_episodes(episodes)
+    engine, count = physics_or_default(physics, robot), checked_episodes(episodes)
     settings = {"physics": engine, "episodes": count, "seed": seed}
     settings |= {"tracks": [randomization]} if randomization else {}
     facts = open_run(out, workers, {robot: chosen}, robot, **settings)

@@ -50,7 +50,7 @@ def optimize(
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
     take = figures.Take("optimum", trajectory, labels.color("trajopt"))
-    figure = figures.trajectory_figure(env.task.id, [take], env.task.markers(info["constants"]))
+    figure = figures.trajectory_figure(env.task.id, [take], env.task.markers(info["constants"]), env.params)
     picture = figures.save(figure, out / "figure.png")
     rows = [
         ["cost", f"{optimum.cost:.6f}"],

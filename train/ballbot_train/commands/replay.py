@@ -54,7 +54,7 @@ def replay(
     _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
-    physics = physics_or_default(physics)
+    physics = physics_or_default(physics, robot)
     if all(Path(entry).suffix == ".npz" for entry in source):
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")

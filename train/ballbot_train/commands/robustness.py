@@ -42,7 +42,7 @@ def robustness(
     chosen = controllers_of(tasks, controllers, robot)
     if not controllers:
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
-    physics = physics_or_default(physics)
+    physics = physics_or_default(physics, robot)
     check_some("stress", stresses, stressed.STRESSES)
     settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     facts = open_run(out, workers, {robot: chosen}, robot, **settings)

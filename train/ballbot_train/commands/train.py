@@ -100,7 +100,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     optima.known(problem, run.robot, workers=Workers(), randomization=varied)
     start = None if run.start is None else load_network(run.start, problem, robot=None)
     made = LEARNERS[learner].make(problem, params, settings, run.seed, run.demos, start, *given)
-    physics = physics_or_default(None)
+    physics = physics_or_default(None, run.robot)
     row = training.train(made, problem, config, out, run.resume, run.test_episodes)
     console.print(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "

@@ -67,7 +67,7 @@ def transfer(
     chosen = controllers_by_robot(tasks, controllers, made_for)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
-    engines, episodes = [physics_or_default(one) for one in physics or (None,)], checked_episodes(episodes)
+    engines, episodes = [physics_or_default(one, robot) for one in physics or (None,)], checked_episodes(episodes)
     settings = {"frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
     facts = open_run(out, workers, chosen, robot, **settings)
     groups = [

@@ -131,7 +131,7 @@ def evaluate(
             }
             results, facts = held.joined(Path(out), ran, more, results)
             write_leaderboard(leaderboard(results), results, provenance() | facts, Path(out))
-            if not env.params.OUTPUTS and not env.randomization.active:
+            if not env.randomization.active:
                 who = env.physics, named[0], digest
                 recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)
         return row

@@ -9,8 +9,8 @@ An .npz file holds
 |---|---|---|
 | about | (bytes,) uint8 | JSON: what ran, see `Recording.about` |
 | lengths | (n,) uint32 | control steps of episodes 0 to n − 1; 0 where the controller found no plan |
-| states | (5, 8, steps + n) uint8 | all states in turn, see `_packed` |
-| actions | (5, 2, steps) uint8 | all actions in turn |
+| states | (5, n_x, steps + n) uint8 | all states in turn, see `_packed`; n_x is the robot's `state_size` |
+| actions | (5, n_u, steps) uint8 | all actions in turn; n_u is the robot's `action_size` |
 """
 
 import json
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import files
-from ballbot_gym.robot import Robot, file_name, robot_name
+from ballbot_gym.robot import ROBOTS, Robot, file_name, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.names import file_part
@@ -44,7 +44,7 @@ _MOST = 2**36  # grid units, of which no second difference needs more
 
 @dataclass(frozen=True)
 class Recording:
-    """A file's content: states (steps + n, 8) m, rad and per second, actions (steps, 2), and each episode's control steps."""
+    """A file's content: states (steps + n, n_x) in SI units, actions (steps, n_u), and each episode's control steps."""
 
     about: dict[str, Any]
     """"task" (a name), "problem" (`Task.problem`), "robot", "physics", "controller", "policy" (the digest of its weights, or
@@ -57,7 +57,7 @@ class Recording:
 def of_episode(trajectory: Trajectory | None, params: Robot) -> Recording:
     """What was done in one episode; None is that no plan was found."""
     if trajectory is None:
-        return Recording({}, np.zeros(1, np.int64), np.zeros((0, 8)), np.zeros((0, 2)))
+        return Recording({}, np.zeros(1, np.int64), np.zeros((0, params.state_size)), np.zeros((0, params.action_size)))
     return Recording({}, np.array([len(trajectory.u)]), trajectory.x, trajectory.u / params.force_limit)
 
 
@@ -123,14 +123,27 @@ def read(path: str | Path, content: bytes | None = None) -> Recording:
     if lengths.dtype != np.uint32 or lengths.ndim != 1 or text.dtype != np.uint8 or text.ndim != 1:
         raise files.FileError(f"{path} is no recording: lengths must be uint32 and about uint8, each of one axis")
     steps = int(lengths.sum(dtype=np.int64))
-    shapes = {"states": (_BYTES, 8, steps + int(np.count_nonzero(lengths))), "actions": (_BYTES, 2, steps)}
+    facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
+    sizes = _sizes_of(facts, arrays)
+    shapes = {
+        "states": (_BYTES, sizes[0], steps + int(np.count_nonzero(lengths))),
+        "actions": (_BYTES, sizes[1], steps),
+    }
     for name, shape in shapes.items():
         if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
             raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
-    facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
     return Recording(
         facts, lengths.astype(np.int64), GRID * _unpacked(arrays["states"]), ACTION_GRID * _unpacked(arrays["actions"])
     )
+
+
+def _sizes_of(facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Components of a state and of an action: those of the robot that is named, or else what the arrays have."""
+    if (name := facts.get("robot")) in ROBOTS:
+        robot = ROBOTS[name].params
+        return robot.state_size, robot.action_size
+    states, actions = (arrays[part].shape[1] if arrays[part].ndim == 3 else 0 for part in ("states", "actions"))
+    return states, actions
 
 
 def _packed(values: np.ndarray) -> np.ndarray:

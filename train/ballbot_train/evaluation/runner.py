@@ -180,7 +180,7 @@ def run_groups(
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         seed: of whatever is drawn: episode i draws the same in every group.
-        record: whether to write what the controllers do, for `ballbot submit`, which does not support robots with wheels.
+        record: whether to write what the controllers do, for `ballbot submit`.
     """
     # the optima go along, because workers on other machines do not have this user's cache
     known = {
@@ -193,7 +193,7 @@ def run_groups(
     done, results = iter(jobs.run([job for some in work for job in some], out, workers)), []
     for group, some in zip(groups, work, strict=True):
         entries = [entry for _ in some for entry in next(done)]
-        if record and _is_recordable(group):
+        if record:
             motions = [recordings.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
             who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
@@ -210,16 +210,12 @@ def _without_optima(states: np.ndarray) -> certified.EvaluationSet:
     return certified.EvaluationSet(states, constants=none, drawn=none, statuses=words, trajectories=(), **unknown)
 
 
-def _is_recordable(group: Group) -> bool:
-    return not named_robot(group.robot).OUTPUTS
-
-
 def _jobs_of(
     group: Group, episodes: int, seed: int, known: Mapping[Any, certified.EvaluationSet], record: bool
 ) -> Iterator[jobs.Job]:
     """The jobs of a group, of `CHUNK` episodes each."""
     chosen = known[group.problem] if group.starts is None else _without_optima(group.starts)
-    sent, recorded = registry.portable(group.controller, *group.believed), record and _is_recordable(group)
+    sent, recorded = registry.portable(group.controller, *group.believed), record
     words = "-".join(map(str, (group.task, group.controller, group.physics, *group.told.values())))
     count = episodes if group.starts is None else len(group.starts)
     group = replace(group, starts=None)  # they are in the set
@@ -320,7 +316,7 @@ def run_episodes(
                 "duration": run.trajectory.duration,
                 "plan_seconds": run.reset_seconds,
                 "step_seconds": run.act_seconds,
-                "effort": float(np.hypot(*run.trajectory.u.T).mean()),
+                "effort": float(np.hypot.reduce(run.trajectory.u, axis=1).mean()),
             }
         if motions is not None:
             motions.append(recordings.of_episode(None if run is None else run.trajectory, env.params))

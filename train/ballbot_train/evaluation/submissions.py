@@ -229,10 +229,6 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
     recording = recordings.read(path, content)
     facts = _checked_facts(recording.about, path)
     robot = named_robot(facts["robot"])
-    if robot.OUTPUTS:
-        raise SubmissionError(
-            f"{path}: {facts['robot']} has wheels, and recordings have no heading; the board has no such robots"
-        )
     task = make_task(facts["task"], facts["robot"])
     if facts["problem"] != task.problem():
         raise SubmissionError(f"{path} is of {facts['problem']}, and the certified episodes are of {task.problem()}")

@@ -15,6 +15,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter
 
 from ballbot_gym import files
+from ballbot_gym.robot import Ballbot, Robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.evaluation.basins import AXES, BasinMap, fraction
 from ballbot_train.evaluation.names import ways_on
@@ -27,8 +28,15 @@ _LEGEND_COLUMNS = 4  # below each task's axes
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
 
-def trajectory_figure(title: str, takes: Sequence[Take], markers: Sequence[Marker] = ()) -> Figure:
-    """The paper's form: position, velocity and lean over time, forces over time, and the ground path."""
+def trajectory_figure(
+    title: str, takes: Sequence[Take], markers: Sequence[Marker] = (), robot: Robot | None = None
+) -> Figure:
+    """The paper's form: position, velocity and lean over time, forces over time, and the ground path.
+
+    Of a `robot` that is no ballbot, all components of states and actions over time.
+    """
+    if robot is not None and not isinstance(robot, Ballbot):
+        return _components_figure(title, takes, robot)
     figure = Figure(figsize=(12, 6.2), layout="constrained")
     figure.suptitle(title, fontsize=13)
     axes = figure.subplot_mosaic(
@@ -67,6 +75,29 @@ def trajectory_figure(title: str, takes: Sequence[Take], markers: Sequence[Marke
     path.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
     path.grid(alpha=0.3)
     path.legend(fontsize=9, loc="best")
+    return figure
+
+
+def _components_figure(title: str, takes: Sequence[Take], robot: Robot) -> Figure:
+    shown = [*((each, True, i) for i, each in enumerate(robot.STATE))]
+    shown += [(each, False, i) for i, each in enumerate(robot.ACTION)]
+    columns = min(3, len(shown))
+    figure = Figure(figsize=(4 * columns, 2.6 * math.ceil(len(shown) / columns)), layout="constrained")
+    figure.suptitle(title, fontsize=13)
+    axes = figure.subplots(math.ceil(len(shown) / columns), columns, squeeze=False, sharex=True).ravel()
+    for axis, (quantity, of_state, i) in zip(axes, shown, strict=False):
+        for take in takes:
+            motion = take.trajectory
+            values = motion.x[:, i] if of_state else motion.u[:, i]
+            held = "default" if of_state or not motion.held else "steps-post"
+            name = f"{take.label}, {take.note}" if take.note else take.label
+            axis.plot(motion.t[: len(values)], values, take.style, color=take.color, drawstyle=held, label=name)
+        axis.set_ylabel(f"{quantity.name}, {quantity.unit}")
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    axes[len(shown) - 1].set_xlabel("time, s")
+    for axis in axes[len(shown) :]:
+        axis.set_visible(False)
     return figure
 
 

@@ -106,20 +106,21 @@ class LineProgress(Progress):
                     )
 
 
-def physics_or_default(physics: Physics | None) -> Physics:
-    """The physics that was typed; else the default, with a line if it needs one.
+def physics_or_default(physics: Physics | None, robot: str = "paper") -> Physics:
+    """The physics that was typed; else the default for a robot by name, with a line if it needs one.
 
     Raises:
         ImportError: it is not installed; the message says how to get it.
     """
     from ballbot_gym.engines import check_installed, default_physics
+    from ballbot_gym.robot import named_robot
 
     if physics is not None:
         check_installed(physics)
         return physics
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        chosen = default_physics()
+        chosen = default_physics(named_robot(robot))
     for warning in caught:
         console.print(str(warning.message), soft_wrap=True)
     return cast(Physics, chosen)
