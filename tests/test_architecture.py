@@ -20,7 +20,11 @@ ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for 
 
 
 # The rooms from the bottom to the top. A file imports from its own room and from those below it only.
-ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "learning", "report", "commands")
+ROOMS = (
+    "ballbot_gym",
+    *("solvers", "optimum", "feedback", "paper", "ballbot_baselines"),
+    *("ground floor", "evaluation", "learning", "report", "commands"),
+)
 
 
 @functools.cache
@@ -59,9 +63,9 @@ def room(module):
     The entry point `ballbot_train.cli` belongs to the commands.
     """
     top, *inner = module.split(".")
-    if top != "ballbot_train":
-        return top if top in PACKAGES else None
     below = inner[0] if inner else ""
+    if top != "ballbot_train":
+        return below if top == "ballbot_baselines" and below in ROOMS else top if top in PACKAGES else None
     return "commands" if below == "cli" else below if below in ROOMS else "ground floor"
 
 

@@ -16,7 +16,7 @@ def run(code, *blocked):
 
 
 MISSING = [  # in an order in which nothing imports what is missing later
-    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
+    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0', compile=True)", "torch", "train"),
     (
         "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
         *("scipy", "baselines"),
@@ -83,7 +83,7 @@ for package in ("ballbot_gym", "ballbot_baselines", "ballbot_train"):
 """
     lines = run(code, *EXTRAS).splitlines()
     assert [line for line in lines if not line.startswith(("light ", "named "))] == []
-    for name in ("ballbot_baselines.ocp", "ballbot_gym.batch", "ballbot_train.learning.learners.ppo"):
+    for name in ("ballbot_baselines.solvers.ocp", "ballbot_gym.batch", "ballbot_train.learning.learners.ppo"):
         assert any(line.startswith(f"named {name} ") for line in lines)
     for name in ("ballbot_gym.env", "ballbot_train"):
         assert f"light {name}" in lines

@@ -8,8 +8,8 @@ import casadi
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import TrajoptController
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics, omni
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
@@ -300,12 +300,7 @@ def test_a_free_heading_costs_nothing(robot):
 
 
 def test_what_knows_no_wheels_says_so(robot):
-    from ballbot_baselines import batched
-
     task = make_task("stabilize", "omni")
-    assert not batched.solves(task, robot)
-    with pytest.raises(NotImplementedError, match="no robot with wheels"):
-        batched.find_optima(task, robot, np.zeros((1, 8)), np.zeros((1, 0)))
     with pytest.raises(ValueError, match="pushes are forces Fx, Fy, which a robot with wheels does not have"):
         BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
     with pytest.raises(ValueError, match="omni has three wheels, and neither a frame nor mirror images"):

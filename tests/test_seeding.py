@@ -7,7 +7,6 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from ballbot_baselines import batched
 from ballbot_gym import seeding
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv
@@ -18,7 +17,7 @@ from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import BallbotVecEnv
 from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.learning import demonstrations
-from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners import LEARNERS, dagger
 from ballbot_train.learning.rsl import RslVecEnv
 
 ENVS = 64
@@ -76,7 +75,7 @@ def test_trainings_with_neighbouring_seeds_share_no_start(name, starts, monkeypa
     def plan(*arguments, **options):
         raise Drawn
 
-    monkeypatch.setattr(batched, "find_optima", plan)
+    monkeypatch.setattr(dagger, "find_optima", plan)
     settings = LEARNERS[name].settings("stabilize")
     known = {field.name for field in fields(settings)}
     settings = replace(settings, **{key: value for key, value in SMALL.items() if key in known})

@@ -1,17 +1,20 @@
 """The search of hyperparameters: it finds the better settings, goes on after a kill, and writes what tools read."""
 
 import json
+import shlex
 from dataclasses import replace
 
 import pytest
 
 pytest.importorskip("optuna")
 
+import optuna
 import yaml
 from builders import measured
 from optuna.distributions import CategoricalDistribution as Categorical
 from optuna.distributions import FloatDistribution as Float
 
+from ballbot_gym import Stabilize
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.tune import tune
 from ballbot_train.learning import tuning
@@ -118,6 +121,31 @@ def test_another_search_is_not_mixed_into_a_folder(fakes, tmp_path):
     tuning.run(SEARCH, 1, tmp_path)
     with pytest.raises(ValueError, match="env_steps"):
         tuning.run(replace(SEARCH, env_steps=5), 2, tmp_path)
+
+
+def test_a_search_is_not_continued_with_another_problem_of_its_name(fakes, tmp_path, monkeypatch):
+    tuning.run(SEARCH, 1, tmp_path)
+
+    class Dearer(Stabilize):
+        def cost(self, x, u, c):
+            return 1.001 * super().cost(x, u, c)
+
+    Dearer.__name__ = "Stabilize"
+    monkeypatch.setitem(TASKS, "stabilize", Dearer)
+    with pytest.raises(ValueError, match="another problem: its costs have changed since"):
+        tuning.run(SEARCH, 2, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["what?", "50%25", "a#b", "it's", "mode=ro&x", "[red]", "{x}"])
+def test_a_study_is_in_its_folder_whatever_that_is_called(fakes, tmp_path, name, capsys, monkeypatch):
+    out = tmp_path / name
+    tune("ppo", trials=1, env_steps=100_000, evaluations=2, out=out)
+    assert {"best.json", "config.json", "ppo.yml", "study.db"} == {path.name for path in out.iterdir()}
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("trials: "))
+    *_, into, _, _, _, _, _, _, storage = shlex.split(line)
+    monkeypatch.chdir(into)
+    assert len(optuna.load_study(study_name="tune", storage=storage).trials) == 1
 
 
 @pytest.mark.parametrize("learner", ["ppo", "sac"])

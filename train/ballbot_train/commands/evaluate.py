@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, file_name
@@ -58,17 +59,20 @@ def evaluate(
     check_least(0, optima=optima)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
-    named = f"{task}-{file_part(policy)}" + (f"-on-{randomization}" if randomization else "")
+    named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
     episodes.check_fresh(fresh, seed)
     episodes.history_of(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
     jobs.make_folder(out)
+    of = {"task": task, "policy": policy, "robot": robot, "randomization": randomization or ""}
+    if (out / "fresh.json").exists():  # of the same policy they are replaced
+        about = files.read_json(out / "fresh.json").get("about")
+        held = {name: about.get(name, of[name]) for name in of} if isinstance(about, dict) else {}
+        jobs.check_same(held, of, out, "results")
     facts = provenance() | {
-        "task": task,
-        "policy": policy,
-        "robot": robot,
+        **of,
         "policies": policy_digests({task: [policy]}, robot),
         "seed": seed,
         "episodes": fresh,

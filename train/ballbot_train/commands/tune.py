@@ -1,5 +1,6 @@
 """`ballbot tune LEARNER`: a learner's hyperparameters by search, on several seeds, resumable."""
 
+import shlex
 from pathlib import Path
 
 from ballbot_gym.robots import PAPER, file_name
@@ -57,8 +58,9 @@ def tune(
     ]
     header = ["seed", "validation cost", "success", "certified regret"]
     print_table(f"the best, trial {best['trial']}, of {learner} on {task}", header, rows)
+    listed = f"cd {shlex.quote(str(out))} && optuna trials --study-name tune --storage sqlite:///study.db"
     console.print(
-        f"trials: optuna trials --study-name tune --storage sqlite:///{out / 'study.db'}\nsettings: {out / 'best.json'}\n"
+        f"trials: {listed}\nsettings: {out / 'best.json'}\n"
         f"train with them: {command_with(learner, Run(task=task, robot=robot), settings)}",
         soft_wrap=True,
     )

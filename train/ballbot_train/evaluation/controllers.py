@@ -1,13 +1,14 @@
 """Controllers by name: experts of `CONTROLLERS`, policies that come with the package, policy files and saved models."""
 
 from pathlib import Path
+from types import ModuleType
 
-from ballbot_baselines import CONTROLLERS, FILTERS, VARIANTS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_train import policy_files
 from ballbot_train.console import check_names
 from ballbot_train.policy_files import is_run, read_description, shipped_policies, weights_digest
 
@@ -15,29 +16,36 @@ FILTERED = "-ekf"
 """Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
 
 
+def _experts() -> ModuleType:
+    """The package of the experts. It is imported where they are asked for by name: who evaluates a function needs none."""
+    import ballbot_baselines
+
+    return ballbot_baselines
+
+
 def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
     """The controllers that a task has for a robot, experts first; tracks as of `shipped_policies`."""
-    return [*CONTROLLERS, *shipped_policies(task, robot, track)]
+    return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
 def filters(params: BallbotParams) -> tuple[str, ...]:
     """What may follow the names of controllers of a robot."""
-    return FILTERS if params.wheels is None else (FILTERED,)
+    return _experts().FILTERS if params.wheels is None else (FILTERED,)
 
 
 def plain(name: str) -> str:
     """The name of a controller without the filter in front of it."""
-    return name if name in VARIANTS else name.removesuffix(_filter_of(name))
+    return name if name in _experts().VARIANTS else name.removesuffix(_filter_of(name))
 
 
 def _filter_of(name: str) -> str:
     """Which of `FILTERS` a name ends with, or ""."""
-    return next((ending for ending in FILTERS if name.endswith(ending)), "")
+    return next((ending for ending in _experts().FILTERS if name.endswith(ending)), "")
 
 
 def is_expert(name: str) -> bool:
     """Whether a name is an expert's or a variant's, and no policy's."""
-    return plain(name) in CONTROLLERS | VARIANTS
+    return plain(name) in _experts().CONTROLLERS | _experts().VARIANTS
 
 
 def is_file(name: str) -> bool:
@@ -57,7 +65,7 @@ def acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
         return is_made_for(name, task, robot)
     ending = _filter_of(name)
     behind = not ending or ending in filters(named_robot(robot))
-    return name in VARIANTS or (behind and name.removesuffix(ending) in names(task, robot, None))
+    return name in _experts().VARIANTS or (behind and name.removesuffix(ending) in names(task, robot, None))
 
 
 def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
@@ -97,6 +105,12 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
     return weights_digest(shipped_policies(task, robot, None).get(name, name))
 
 
+def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
+    """Digest of the network of a policy by name or file, as its description says; see `policy_files.network_digest`."""
+    name = plain(name)
+    return policy_files.network_digest(shipped_policies(task, robot, None).get(name, name))
+
+
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
     """The task that is named, or the registered one that a policy file names, or stabilize.
 
@@ -127,7 +141,7 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
     shipped = shipped_policies(task, robot, None)
     if name in shipped:
         return shipped[name]
-    if name in CONTROLLERS:
+    if name in _experts().CONTROLLERS:
         raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
     if not is_file(name):
         raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
@@ -159,22 +173,22 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    if name in VARIANTS and params.wheels is None:
-        return VARIANTS[name](task, params)
+    if name in _experts().VARIANTS and params.wheels is None:
+        return _experts().VARIANTS[name](task, params)
     ending = _filter_of(name)
     controller = _unfiltered(name.removesuffix(ending), task, params)
     if getattr(controller, "told", None) is not None:  # it wants to be told the robot
         ending = ending or "-adaptive"
     if not ending:
         return controller
-    from ballbot_baselines.adaptive import FilteredController  # it imports CasADi
+    from ballbot_baselines.feedback.adaptive import FilteredController  # it imports CasADi
 
     return FilteredController(task, params, ending, controller)
 
 
 def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
-    if name in CONTROLLERS | VARIANTS:
-        return (CONTROLLERS | VARIANTS)[name](task, params)
+    if name in _experts().CONTROLLERS | _experts().VARIANTS:
+        return (_experts().CONTROLLERS | _experts().VARIANTS)[name](task, params)
     robot = robot_name(params)
     shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):

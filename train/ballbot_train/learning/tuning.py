@@ -25,9 +25,11 @@ prune, and say what theirs reached.
 
 import json
 import math
+import sqlite3
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import named_problem_digest
+from ballbot_gym.identity import named_problem
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
@@ -48,6 +50,7 @@ from ballbot_train.learning.learners import LEARNERS, ppo, sac
 with imports_of("ballbot tune", "tune"):
     import optuna
     import sqlalchemy.exc  # Optuna's, as is yaml
+    import sqlalchemy.pool
     import yaml
 
 _STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
@@ -132,7 +135,7 @@ def run(
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
     workers = Workers.of(workers)  # refused before anything is written
-    jobs.claim(out, asdict(search) | {"problem": named_problem_digest(search.task, search.robot)}, "config.json")
+    jobs.claim(out, asdict(search) | {"problem": named_problem(search.task, search.robot)}, "config.json")
     try:
         study = open_study(search, out)
         ended = _State.COMPLETE, _State.PRUNED
@@ -165,7 +168,9 @@ def run(
 def open_study(search: Search, out: Path) -> "optuna.Study":
     """The study of a folder. Its first trial has the settings that are tuned for the task."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = f"sqlite:///{(out / _STUDY).absolute()}"
+    # the path is no part of a URL, which a `?` in the name of a folder would end
+    connect = {"creator": partial(sqlite3.connect, (out / _STUDY).absolute()), "poolclass": sqlalchemy.pool.NullPool}
+    storage = optuna.storages.RDBStorage("sqlite://", engine_kwargs=connect)
     study = optuna.create_study(storage=storage, study_name="tune", direction="minimize", load_if_exists=True)
     # The sampler's numbers depend on how many trials there are, so that a search that goes on proposes new ones.
     study.sampler = optuna.samplers.TPESampler(

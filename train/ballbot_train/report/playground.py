@@ -16,7 +16,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ballbot_baselines.lqr import LqrController
+from ballbot_baselines import LqrController
 from ballbot_gym import certified, drawing, dynamics, files
 from ballbot_gym.drawing import page
 from ballbot_gym.env import make_task

@@ -24,7 +24,7 @@ from typing import Any, cast
 
 import torch
 
-from ballbot_baselines.lqr import equilibrium_gain
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
