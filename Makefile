@@ -134,7 +134,7 @@ release: $(VENV)/installed
 
 # Ray clusters of two nodes on this machine, with nodes that are killed
 ray: $(VENV)/installed
-	$(INSTALL) -e ".[ray,tune]"
+	$(INSTALL) -e ".[ray]"
 	$(BIN)/pytest tests/test_ray.py
 
 # the optima that the package ships, computed anew

@@ -19,7 +19,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.paths import sides_passed
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train import jobs
+from ballbot_train.work import jobs
 
 _DETOURS = 3
 _SHORTEST = 5  # paths of the former search for slaloms

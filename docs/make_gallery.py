@@ -29,7 +29,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries
-from ballbot_train.policy_files import SHIPPED
+from ballbot_train.policy.files import SHIPPED
 from ballbot_train.report import figures, labels
 from ballbot_train.report.replay import Replay, Take, certified_replay, driven_path
 

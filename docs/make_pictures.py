@@ -19,7 +19,7 @@ from pathlib import Path
 
 from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
+from ballbot_train.evaluation.controllers import controllers_of, policy_digests
 
 PICTURES = Path(__file__).parent / "pictures"
 MADE = PICTURES / "made.json"

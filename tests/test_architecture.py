@@ -23,7 +23,7 @@ ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for 
 ROOMS = (
     "ballbot_gym",
     *("solvers", "optimum", "feedback", "paper", "ballbot_baselines"),
-    *("ground floor", "evaluation", "learning", "report", "commands"),
+    *("ballbot_train", "work", "policy", "evaluation", "learning", "report", "commands"),
 )
 
 
@@ -64,9 +64,9 @@ def room(module):
     """
     top, *inner = module.split(".")
     below = inner[0] if inner else ""
-    if top != "ballbot_train":
-        return below if top == "ballbot_baselines" and below in ROOMS else top if top in PACKAGES else None
-    return "commands" if below == "cli" else below if below in ROOMS else "ground floor"
+    if top == "ballbot_baselines":
+        return below if below in ROOMS else top
+    return "commands" if below == "cli" else below if below in ROOMS else top
 
 
 def room_of(path):

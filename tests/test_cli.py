@@ -109,10 +109,9 @@ def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, ho
 @pytest.mark.parametrize(
     ("arguments", "option", "help"),
     [
-        (("train", "shac", "--taks", "turn"), "--task", "ballbot train shac --help"),
+        (("train", "apg", "--taks", "turn"), "--task", "ballbot train apg --help"),
         (("train", "--taks", "turn"), "", "ballbot train --help"),
-        (("train", "shac", "--task"), "--task", "ballbot train shac --help"),
-        (("tune", "ppo", "--tiral", "3"), "--trials", "ballbot tune --help"),
+        (("train", "apg", "--task"), "--task", "ballbot train apg --help"),
         (("benchmark", "--taks", "turn"), "--tasks", "ballbot benchmark --help"),
     ],
 )

@@ -12,15 +12,15 @@ from ballbot_gym import TASKS, Stabilize, named_robot, ops
 from ballbot_gym.identity import PARTS, changed_parts, named_problem, problem_parts
 from ballbot_gym.params import ROLLING_URDF_PATH, BallbotParams
 from ballbot_gym.robots import ROBOTS, Robot, register_robot, registered_name, robot_name
-from ballbot_train import jobs
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.demos import demos
-from ballbot_train.evaluation.benchmark import open_run
+from ballbot_train.evaluation.runner import open_run
 from ballbot_train.learning import training
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS, shac
-from ballbot_train.policy import PolicyNetwork, save_policy
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.work import jobs
 
 PAPER = named_robot("paper")
 TINY = shac.ShacConfig(iterations=1, evaluations=1, num_envs=2, horizon=2, hidden=(4,))

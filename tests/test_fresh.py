@@ -23,8 +23,8 @@ from ballbot_train.commands.evaluate import evaluate
 from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.learning import training
-from ballbot_train.policy import load_policy
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.policy.files import shipped_policies
+from ballbot_train.policy.network import load_policy
 
 
 def idle(observation):

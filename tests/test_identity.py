@@ -12,11 +12,12 @@ from ballbot_gym import TASKS, Stabilize, Turn, named_robot
 from ballbot_gym.env import make_task
 from ballbot_gym.identity import observation_digest, problem_digest
 from ballbot_gym.robots import ROBOTS, Robot
-from ballbot_train import evaluate, jobs, load_policy, shipped_policies
+from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
-from ballbot_train.evaluation.benchmark import open_run
-from ballbot_train.policy import PolicyNetwork, load_network, save_policy
-from ballbot_train.policy_files import PolicyError, PolicySpec, read_description
+from ballbot_train.evaluation.runner import open_run
+from ballbot_train.policy.files import PolicyError, PolicySpec, read_description
+from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
+from ballbot_train.work import jobs
 
 PAPER = named_robot("paper")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from ballbot_train import jobs
-from ballbot_train.executors import WorkerError
-from ballbot_train.provenance import commit_of
+from ballbot_train.work import jobs
+from ballbot_train.work.executors import WorkerError
+from ballbot_train.work.provenance import commit_of
 
 
 def squares(log, items):
@@ -68,7 +68,7 @@ def lives(process):
 def test_workers_end_with_a_run_that_is_killed(tmp_path):
     (tmp_path / "endless.py").write_text(ENDLESS)
     code = (
-        "import sys; from pathlib import Path; sys.path.insert(0, '.'); import endless; from ballbot_train import jobs\n"
+        "import sys; from pathlib import Path; sys.path.insert(0, '.'); import endless; from ballbot_train.work import jobs\n"
         "work = [jobs.Job(str(i), endless.work, ('.',), (0,)) for i in range(2)]\n"
         "if __name__ == '__main__': jobs.run(work, Path('out'), 2, lambda group, count: None)"
     )
@@ -120,7 +120,7 @@ def test_the_files_of_a_claim_keep_facts_that_are_not_compared(tmp_path):
 HOLDING = """
 import sys
 from pathlib import Path
-from ballbot_train import jobs
+from ballbot_train.work import jobs
 
 jobs.claim(Path(sys.argv[1]), {"seed": 1})
 print("claimed", flush=True)
@@ -222,7 +222,7 @@ def test_of_nested_settings_only_those_that_differ_are_named(tmp_path):
 
 
 WITHOUT_GUARD = """
-from ballbot_train import jobs
+from ballbot_train.work import jobs
 from pathlib import Path
 from test_jobs import ignore, job, squares
 

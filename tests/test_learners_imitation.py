@@ -15,9 +15,9 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS
-from ballbot_train.learning import routing, training
+from ballbot_train.learning import dagger, routing, training
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.learners import LEARNERS, dagger
+from ballbot_train.learning.learners import LEARNERS
 
 CLONING = dagger.DaggerConfig(iterations=4, gathering_iterations=0, gradient_steps=20, batch_size=128, hidden=(16,))
 TINY_DAGGER = dagger.DaggerConfig(

@@ -11,10 +11,10 @@ from ballbot_gym import TASKS, Stabilize, Trajectory, certified
 from ballbot_train import evaluate
 from ballbot_train.commands import replay as replays
 from ballbot_train.commands.benchmark import benchmark
+from ballbot_train.evaluation.names import file_part, shortened
 from ballbot_train.evaluation.recordings import file_of
 from ballbot_train.evaluation.results import read_results, table_cells
-from ballbot_train.names import file_part, shortened
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.policy.files import shipped_policies
 from ballbot_train.report import figures
 from ballbot_train.report.labels import labels
 from ballbot_train.report.replay import Replay, Take

@@ -21,11 +21,11 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.policy import PolicyNetwork, load_network, save_policy
-from ballbot_train.policy_files import BEST, SHIPPED, PolicyError, PolicySpec, shipped_policies
+from ballbot_train.policy.files import BEST, SHIPPED, PolicyError, PolicySpec, shipped_policies
+from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy.printed import javascript_function
 from ballbot_train.report import playground
 from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
-from ballbot_train.report.printed import javascript_function
 
 CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
 FLOAT32 = 2e-5  # with Python's policy in single precision; measured: 5e-6

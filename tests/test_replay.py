@@ -14,7 +14,7 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train import cli
 from ballbot_train.commands.replay import replay
-from ballbot_train.names import file_part
+from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import film_frames, film_times, write_film
 from ballbot_train.report.replay import (
     LEAST_SLIP,

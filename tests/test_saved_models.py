@@ -24,11 +24,11 @@ from ballbot_gym import TASKS, Stabilize, certified, ops
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_train import BallbotVecEnv, RegretCallback
-from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
-from ballbot_train.policy_files import PolicyError
-from ballbot_train.saved_models import load_actor
+from ballbot_train.policy.files import PolicyError
+from ballbot_train.policy.saved_models import load_actor
 
 TASK = make_task("stabilize")
 OBSERVATIONS = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)

@@ -11,8 +11,7 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
-from ballbot_train.evaluation.benchmark import controllers_of
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import controllers_of, make_controller
 from ballbot_train.evaluation.evaluate import evaluate
 
 DT = 0.02

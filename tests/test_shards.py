@@ -14,10 +14,10 @@ import pytest
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import ROBOTS, named_robot, robot_name
-from ballbot_train import shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.learning.datasets import command_of, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
+from ballbot_train.work import shards
 
 TASK = make_task("turn")
 CONFIG = DemoConfig("turn", "lqr", episodes=7, physics="rk4")

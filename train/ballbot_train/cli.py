@@ -20,13 +20,13 @@ from typing import Any
 try:
     from rich.table import Table
 
-    from ballbot_train.console import PlainConsole
+    from ballbot_train.work.console import PlainConsole
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 
     sys.exit(str(missing("ballbot", error.name, "train")))
 
-from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, MOVED, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -66,6 +66,9 @@ def _run(arguments: list[str]) -> int:
 
         sys.stdout.write(f"ballbot {version('ballbot-gym')}\n")
         return 0
+    if command in MOVED:
+        errors.print(MOVED[command], style="red")
+        return 2
     if command not in COMMANDS:
         close = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
@@ -186,7 +189,7 @@ def _again(command: str, options: list[str]) -> str:
 def _expected() -> tuple[type[RuntimeError], ...]:
     """The other errors that a user can cause. An `except` asks for them when there is an error."""
     from ballbot_gym.rollout import PlanError
-    from ballbot_train.executors import WorkerError
+    from ballbot_train.work.executors import WorkerError
 
     return PlanError, WorkerError
 

@@ -11,12 +11,15 @@ COMMANDS = {
     name: f"{__name__}.{name}:{name}"
     for name in (
         *("benchmark", "evaluate", "compare", "submit", "verify", "robustness", "transfer", "basins", "paper"),
-        *("optimize", "replay", "play", "page", "certify", "demos", "export", "train", "tune", "new"),
+        *("optimize", "replay", "play", "page", "certify", "demos", "export", "train", "new"),
     )
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 
-RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train", "tune")
+MOVED = {"tune": "`ballbot tune` is an example now: python examples/tune.py --task TASK (in the source repository)"}
+"""What to do in place of commands of earlier versions."""
+
+RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train")
 """Those that continue where they were interrupted; `train` does it with --resume."""
 
 

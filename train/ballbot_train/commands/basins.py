@@ -3,14 +3,15 @@
 from pathlib import Path
 
 from ballbot_gym.robots import PAPER
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table
 from ballbot_train.evaluation import basins as maps
-from ballbot_train.evaluation.benchmark import controllers_of, open_run
-from ballbot_train.executors import Workers
-from ballbot_train.names import ways_on, with_way
+from ballbot_train.evaluation.controllers import controllers_of
+from ballbot_train.evaluation.names import ways_on, with_way
+from ballbot_train.evaluation.runner import open_run
 from ballbot_train.report import figures
+from ballbot_train.work import jobs
+from ballbot_train.work.console import Physics, RobotName, console, physics_or_default, print_table
+from ballbot_train.work.executors import Workers
 
 
 def basins(

@@ -8,16 +8,8 @@ from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, console, physics_or_default
 from ballbot_train.evaluation import robustness
-from ballbot_train.evaluation.benchmark import (
-    Group,
-    controllers_of,
-    open_run,
-    publish,
-    run_groups,
-)
-from ballbot_train.evaluation.evaluate import checked_episodes
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import (
     HEADER,
     TABLE,
@@ -26,10 +18,12 @@ from ballbot_train.evaluation.results import (
     write_leaderboard,
     write_results,
 )
-from ballbot_train.executors import Workers
+from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
 from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Take, certified_replay, telling_episode
+from ballbot_train.work.console import Physics, RobotName, console, physics_or_default
+from ballbot_train.work.executors import Workers
 
 
 def benchmark(

@@ -17,8 +17,8 @@ from ballbot_baselines.paper.problems import (
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks.marker import Marker
-from ballbot_train.console import check_names, console, physics_or_default, print_rows
 from ballbot_train.report import figures, labels
+from ballbot_train.work.console import check_names, console, physics_or_default, print_rows
 
 _GREY = (0.75, 0.75, 0.75, 1.0)
 

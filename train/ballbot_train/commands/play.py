@@ -6,10 +6,10 @@ from typing import Literal
 from ballbot_gym.drawing.viewer import PORT, Viewer, need_library
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER
-from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.report.live_page import PlayPage
 from ballbot_train.report.simulation import Playground, Start
+from ballbot_train.work.console import RobotName, console
 
 
 def play(

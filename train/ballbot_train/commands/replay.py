@@ -6,10 +6,10 @@ from pathlib import Path
 from ballbot_gym.engines import default_physics
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
-from ballbot_train.names import file_part
+from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
 from ballbot_train.report.replay import certified_replay, file_replay
+from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 
 _MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "webp": 640}  # px

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from ballbot_gym import files
 from ballbot_train.commands.verify import print_entries
-from ballbot_train.console import console
 from ballbot_train.evaluation import submissions
+from ballbot_train.work.console import console
 
 
 def submit(

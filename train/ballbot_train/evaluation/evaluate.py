@@ -4,93 +4,60 @@ Importing this module is light: torch is imported for policy files, CasADi for e
 """
 
 import math
-import numbers
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, overload
 
-import numpy as np
-
-from ballbot_gym import certified, seeding
+from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.identity import problem_parts
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import name_of
-from ballbot_gym.robots import PAPER
-from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
+from ballbot_gym.robots import PAPER, robot_name
 from ballbot_gym.tasks import Task
-from ballbot_train.console import late_bar
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.controllers import is_file, make_controller, policy_digest
+from ballbot_train.evaluation.controllers import as_controller, is_file, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.executors import Workers
-from ballbot_train.policy_files import PolicyError
-from ballbot_train.provenance import provenance
+from ballbot_train.evaluation.runner import checked_episodes, run_episodes, shown_to
+from ballbot_train.work.console import late_bar
+from ballbot_train.work.executors import Workers
+from ballbot_train.work.provenance import provenance
+
+if TYPE_CHECKING:
+    from ballbot_train.evaluation.fresh import FreshResult
 
 
-def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
-    """Anything that acts, as a Controller.
-
-    Args:
-        policy: a Controller; a Stable-Baselines3 model that was trained in the env's own spaces, whose VecNormalize is
-            applied where it was trained with one; a function from observation (no,) float32 to action (2,) in [−1, 1]; or a
-            name or file for `make_controller`.
-        task: what it is to do.
-        params: the robot that it believes to control.
-
-    Raises:
-        TypeError: it is none of these.
-        ValueError, PolicyError: as `make_controller`; or the model was trained in other spaces than the env's.
-    """
-    if isinstance(policy, str | Path):
-        return make_controller(str(policy), task, params)
-    if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
-        return policy
-    if callable(getattr(policy, "predict", None)):
-        predictor = Predictor(policy, task, params)
-        return ActionController(task, params, predictor, predictor.history)
-    if callable(policy):
-        function = cast(Callable[[np.ndarray], np.ndarray], policy)
-        return ActionController(task, params, lambda observation, begins: function(observation))
-    raise TypeError(
-        f"{policy!r} is no policy: give a Controller, a model with predict, a function of the observation, a name or a file"
-    )
+@overload
+def evaluate(
+    policy: Any,
+    task: str | Task = ...,
+    episodes: int = ...,
+    physics: str | None = ...,
+    name: str | None = ...,
+    randomization: Randomization | str | None = ...,
+    robot: str | BallbotParams = ...,
+    workers: int | Workers = ...,
+    out: str | Path | None = ...,
+    fresh: None = None,
+) -> Row: ...
 
 
-class Predictor:
-    """An SB3 model's deterministic actions (..., 2) for observations (..., no) of an episode, or of one episode per env.
-
-    It keeps the recurrent state, and normalizes observations as in training.
-    """
-
-    def __init__(self, model: Any, task: Task, params: BallbotParams):
-        self._model, self._state, self.history = model, None, 0
-        if hasattr(model, "observation_space"):
-            from ballbot_train.saved_models import check_spaces, history_of  # it imports torch
-
-            self.history = history_of(model, task, params)
-            check_spaces(type(model).__name__, model, task, params)
-        normalization = getattr(model, "get_vec_normalize_env", lambda: None)()
-        # only on-policy algorithms leave this empty where there was no VecNormalize
-        if normalization is None and hasattr(model, "gae_lambda") and model._last_original_obs is not None:
-            raise PolicyError(
-                f"{type(model).__name__} was trained with VecNormalize and has none now; load the model with it: "
-                f'{type(model).__name__}.load("model.zip", env=VecNormalize.load("vecnormalize.pkl", venv))'
-            )
-        self._seen = (lambda observation: observation) if normalization is None else normalization.normalize_obs
-
-    def __call__(self, observation: np.ndarray, begins: bool) -> np.ndarray:
-        action, self._state = self._model.predict(
-            self._seen(observation),
-            state=None if begins else self._state,
-            episode_start=np.full(len(np.atleast_2d(observation)), begins),
-            deterministic=True,
-        )
-        return action
+@overload
+def evaluate(
+    policy: Any,
+    task: str | Task = ...,
+    episodes: int = ...,
+    physics: str | None = ...,
+    name: str | None = ...,
+    randomization: Randomization | str | None = ...,
+    robot: str | BallbotParams = ...,
+    workers: int | Workers = ...,
+    out: str | Path | None = ...,
+    *,
+    fresh: int,
+) -> "FreshResult": ...
 
 
 def evaluate(
@@ -103,8 +70,9 @@ def evaluate(
     robot: str | BallbotParams = PAPER,
     workers: int | Workers = 1,
     out: str | Path | None = None,
-) -> Row:
-    """The leaderboard row of anything that acts.
+    fresh: int | None = None,
+) -> "Row | FreshResult":
+    """The leaderboard row of anything that acts, on certified episodes; or, with `fresh`, what it does on fresh episodes.
 
     Where the package has no optima of the task and the robot, they are computed, and kept in the user's cache. On a
     terminal, a bar shows the episodes where they take longer than two seconds.
@@ -123,12 +91,23 @@ def evaluate(
             does: what it does must be under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
             Rows of other policies and tasks that are there already stay.
+        fresh: instead of certified episodes, the number of fresh ones: then this is `evaluate_fresh`, in the batched
+            closed-form model.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes; or a randomization with an actuator that lags, under
             which no optimum is known.
         PlanError: an episode has no optimum that can be found.
     """
+    if fresh is not None:
+        from ballbot_train.evaluation.fresh import evaluate_fresh  # it imports torch
+
+        if out is not None or physics not in (None, "rk4"):
+            raise ValueError(
+                "fresh episodes run in the batched closed-form model, and write no folder; leave out physics and out"
+            )
+        named_robot = robot if isinstance(robot, str) else robot_name(robot)
+        return evaluate_fresh(policy, task, fresh, name=name, robot=named_robot, randomization=randomization)
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = range(checked_episodes(episodes))
@@ -194,7 +173,7 @@ class _Held:
         """
         task, name = new[0].task, new[0].controller
         if self.results:
-            from ballbot_train import jobs  # it needs the library of locks
+            from ballbot_train.work import jobs  # it needs the library of locks
 
             jobs.check_same({key: self.about.get(key) for key in ran}, ran, out, "results")
             problems = {key: value for key, value in self.about.get("problems", {}).items() if key == task}
@@ -212,23 +191,6 @@ class _Held:
         return [*(result for result in self.results if result not in row), *new], ran | facts
 
 
-def shown_to(controller: Controller, env: BallbotEnv) -> BallbotEnv:
-    """An env of the same world that shows what a controller takes: sensors, if it `senses`."""
-    if not getattr(controller, "senses", False):
-        return env
-    env.close()
-    return BallbotEnv(env.task, env.physics, params=env.params, randomization=env.randomization, observation="sensors")
-
-
-def checked_episodes(episodes: int) -> int:
-    """A number of certified episodes; raises a ValueError where there are not so many."""
-    if isinstance(episodes, bool) or not isinstance(episodes, numbers.Integral):
-        raise TypeError(f"episodes must be a number of episodes, not {episodes!r}")
-    if not 1 <= episodes <= certified.EPISODES:
-        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
-    return int(episodes)
-
-
 def _name(policy: Any, file: str, task: str, held: _Held | None) -> str:
     """The policy's own name: of a file the folder and the file, and folders above where a row of another file has that."""
     if not isinstance(policy, str | Path):
@@ -241,78 +203,3 @@ def _name(policy: Any, file: str, task: str, held: _Held | None) -> str:
     ]  # a run's folder tells its policy
     free = (name for name in names if held is None or held.file(task, name) in (None, file))
     return next(free, names[-1])
-
-
-def run_episodes(
-    env: BallbotEnv,
-    controller: Controller,
-    name: str,
-    task: str,
-    episodes: Iterable[int],
-    seed: int = 0,
-    known: certified.EvaluationSet | None = None,
-    motions: list[recordings.Recording] | None = None,
-    advance: Callable[[int], None] = lambda count: None,
-) -> list[Result]:
-    """Runs certified episodes under any controller; one that finds no plan has failed the episode. torch computes on one
-    thread meanwhile.
-
-    Args:
-        env: what to run in.
-        controller: what acts.
-        name: of the controller, in the results.
-        task: the task's name, in the results.
-        episodes: their indices.
-        seed: of what the env's randomization draws; no two seeds share what an episode draws.
-        known: the optima; default, those of the env's task, robot and randomization.
-        motions: gets what was done in each episode.
-        advance: is called with 1 after each episode.
-
-    Raises:
-        PlanError: an episode has no optimum that can be found.
-    """
-    indices, results = list(episodes), []
-    if known is None:
-        known = optima.known(env.task, env.params, indices, randomization=env.randomization)
-    for i in indices:
-        run = None
-        try:
-            with _one_thread():
-                run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=known.options(i))
-        except PlanError as error:
-            measures: dict[str, Any] = {"cost": env.task.survival_pay, "note": str(error)}
-            measures |= {"success": False, "failure": True}
-        else:
-            measures = {
-                "cost": run.cost,
-                "success": run.success,
-                "failure": run.failure,
-                "peak_tilt": math.degrees(run.peak_tilt),
-                "settle_time": run.settle_time,
-                "duration": run.trajectory.duration,
-                "plan_seconds": run.reset_seconds,
-                "step_seconds": run.act_seconds,
-                "effort": float(np.hypot(*run.trajectory.u.T).mean()),
-            }
-        if motions is not None:
-            motions.append(recordings.of_episode(None if run is None else run.trajectory, env.params))
-        results.append(Result(task, name, i, env.physics, optimum=float(known.costs[i]), **measures))
-        advance(1)
-    return results
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """torch, if it is imported, computes on one thread within the block: policies are too small for a second one, and threads
-    that wait for each other at every control step make an episode ten times slower.
-    """
-    torch: Any = sys.modules.get("torch")
-    if torch is None:
-        yield
-        return
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

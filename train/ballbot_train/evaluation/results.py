@@ -12,8 +12,8 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.certified import version
 from ballbot_gym.display import Displayed, percent
+from ballbot_train.evaluation.names import shortened, with_way
 from ballbot_train.evaluation.statistics import interval
-from ballbot_train.names import shortened, with_way
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from ballbot_gym.robots import PAPER, named_robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.fitting import start_as_lqr
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over

@@ -13,7 +13,7 @@ from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate
-from ballbot_train.saved_models import mark
+from ballbot_train.policy.saved_models import mark
 
 BEST_MODEL, BEST_STATISTICS = "best_model.zip", "best_model.vecnormalize.pkl"
 

@@ -15,10 +15,10 @@ from ballbot_gym.checks import LARGEST
 from ballbot_gym.identity import problem_parts
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.tasks import Task
-from ballbot_train import shards
-from ballbot_train.console import option
-from ballbot_train.jobs import check_same
-from ballbot_train.policy_files import OBSERVATION_VERSION
+from ballbot_train.policy.files import OBSERVATION_VERSION
+from ballbot_train.work import shards
+from ballbot_train.work.console import option
+from ballbot_train.work.jobs import check_same
 
 IN_DATASET = {
     "observations": "observations",

@@ -47,12 +47,12 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_train import jobs, shards
-from ballbot_train.console import check_names
 from ballbot_train.evaluation import controllers
-from ballbot_train.executors import Workers
 from ballbot_train.learning.datasets import IN_DATASET, metadata_of
-from ballbot_train.policy_files import OBSERVATION_VERSION
+from ballbot_train.policy.files import OBSERVATION_VERSION
+from ballbot_train.work import jobs, shards
+from ballbot_train.work.console import check_names
+from ballbot_train.work.executors import Workers
 
 _LONGER = ("observations", "states")  # than the others by one, of an episode
 _MOST_EPISODES = 1_000_000

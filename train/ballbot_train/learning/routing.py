@@ -15,9 +15,9 @@ from ballbot_baselines.optimum import sides
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
-from ballbot_train.policy import Routes, farther_choices
+from ballbot_train.policy.network import Routes, farther_choices
+from ballbot_train.work.console import console
 
 EPISODES = 60_000
 _DISTANCES = 7  # for which the motion without obstacles is found

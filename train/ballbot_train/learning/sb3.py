@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ballbot_gym.seeding import spawned
 from ballbot_gym.vector import BallbotVectorEnv
-from ballbot_train.saved_models import mark
+from ballbot_train.policy.saved_models import mark
 
 
 class BallbotVecEnv(VecEnv):

@@ -54,16 +54,16 @@ from ballbot_gym.identity import digest, problem_parts
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
-from ballbot_train import jobs
-from ballbot_train.console import console, progress_bar
-from ballbot_train.evaluation import evaluate, fresh
+from ballbot_train.evaluation import evaluate, fresh, runner
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
-from ballbot_train.policy import PolicyNetwork, load_network, save_policy
-from ballbot_train.policy_files import content_digest
-from ballbot_train.provenance import provenance
-from ballbot_train.weights import own_defaults, saved_by_torch
+from ballbot_train.policy.files import content_digest
+from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy.weights import own_defaults, saved_by_torch
+from ballbot_train.work import jobs
+from ballbot_train.work.console import console, progress_bar
+from ballbot_train.work.provenance import provenance
 
 _CONFIG = "config.json"
 _VALIDATION_SEED, _CERTIFIED_SEED = 0, 1
@@ -332,7 +332,7 @@ class _Run:
         network = load_network(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
         controller = make_controller(str(self.out / "policy.json"), self.task, env.params)
-        results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
+        results = runner.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
         row = evaluate.summarize(results)
         figures = ("episodes", "success", "falls", "regret_mean", "regret_median")

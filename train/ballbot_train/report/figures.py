@@ -17,9 +17,9 @@ from matplotlib.ticker import LogFormatter
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.evaluation.basins import AXES, BasinMap, fraction
+from ballbot_train.evaluation.names import ways_on
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
-from ballbot_train.names import ways_on
 from ballbot_train.report.labels import ORDER, color, labels
 from ballbot_train.report.replay import Take
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from ballbot_train.names import ARROW, shortened, with_way
+from ballbot_train.evaluation.names import ARROW, shortened, with_way
 
 _CONTROLLERS = {
     "lqr": ("LQR", "#c0392b"),
@@ -14,6 +14,7 @@ _CONTROLLERS = {
     "dagger": ("DAgger", "#34495e"),
     "ppo": ("PPO", "#2e8b57"),
     "sac": ("SAC", "#17a2b8"),
+    "apg": ("APG", "#8e44ad"),
     "shac": ("SHAC", "#8e44ad"),
 }
 ORDER = [name for name, _ in _CONTROLLERS.values()]

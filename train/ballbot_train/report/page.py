@@ -5,19 +5,18 @@ templates escape all text.
 """
 
 import base64
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from ballbot_gym import files
 from ballbot_gym.drawing import page
 from ballbot_train.report.replay import Replay, Take
+from ballbot_train.work import templates
 
 _ASSETS = Path(__file__).parent / "assets"
 _REPLAY_DT = 0.02  # s, between the states in the page
@@ -59,24 +58,9 @@ def report_page(
     return str(text)
 
 
-@functools.cache
-def _templates() -> jinja2.Environment:
-    """The templates of `assets/`; those of pages escape every string that is not a `Markup`."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_ASSETS),
-        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False}
-    return environment
-
-
 def render(template: str, **values: object) -> Markup:
     """A template of `assets/` with these values."""
-    return Markup(_templates().get_template(template).render(values))
+    return templates.render(_ASSETS / template, **values)
 
 
 def asset(name: str) -> Markup:

@@ -25,11 +25,11 @@ from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import outcome
 from ballbot_train.evaluation.controllers import policy_path, task_name
-from ballbot_train.policy import PolicyNetwork, load_network
-from ballbot_train.policy_files import BEST, PolicyError, read_description, shipped_policies
+from ballbot_train.policy.files import BEST, PolicyError, read_description, shipped_policies
+from ballbot_train.policy.network import PolicyNetwork, load_network
+from ballbot_train.policy.printed import javascript_function, layers_of, policy_function
 from ballbot_train.report import labels
 from ballbot_train.report.page import asset
-from ballbot_train.report.printed import javascript_function, layers_of, policy_function
 
 _UNKNOWN = {"body_mass": "mass", "com_height": "centre of mass", "force": "force"}
 """Factors that the reader may change, within those of the track "unknown", and what the page calls them."""

@@ -16,11 +16,11 @@ from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.benchmark import floor
 from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.names import shortened
 from ballbot_train.evaluation.results import Result
-from ballbot_train.names import shortened
-from ballbot_train.policy_files import shipped_policies, way_of
+from ballbot_train.evaluation.runner import floor
+from ballbot_train.policy.files import shipped_policies, way_of
 from ballbot_train.report import labels
 
 LEAST_SLIP = 0.02

@@ -21,11 +21,11 @@ from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names
 from ballbot_train.evaluation.controllers import is_expert, make_controller, names
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.policy_files import BEST
+from ballbot_train.policy.files import BEST
 from ballbot_train.report import labels
+from ballbot_train.work.console import check_names
 
 LARGEST_PUSH = 250.0
 """N·s, of a push; larger ones are cut to this length."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.lazy import imports_of
-from ballbot_train.policy_files import PolicyError
+from ballbot_train.policy.files import PolicyError
 
 with imports_of(__name__):
     import torch

@@ -19,8 +19,8 @@ from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.sensors import observation_space
 from ballbot_gym.tasks import Task
-from ballbot_train.policy_files import PolicyError
-from ballbot_train.weights import checked, linear_layers, saved_by_torch
+from ballbot_train.policy.files import PolicyError
+from ballbot_train.policy.weights import checked, linear_layers, saved_by_torch
 
 with imports_of(__name__):
     import torch

@@ -19,8 +19,8 @@ from typing import Any
 from ballbot_gym import files
 from ballbot_gym.identity import changed_parts
 from ballbot_gym.lazy import imports_of
-from ballbot_train.console import progress_bars
-from ballbot_train.executors import Workers, completed
+from ballbot_train.work.console import progress_bars
+from ballbot_train.work.executors import Workers, completed
 
 with imports_of(__name__):
     import filelock

@@ -21,9 +21,9 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.lazy import imports_of
-from ballbot_train import jobs
-from ballbot_train.console import progress_bars
-from ballbot_train.executors import Workers, completed
+from ballbot_train.work import jobs
+from ballbot_train.work.console import progress_bars
+from ballbot_train.work.executors import Workers, completed
 
 with imports_of(__name__):
     import fsspec

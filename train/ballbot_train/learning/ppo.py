@@ -24,26 +24,27 @@ from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, relative_advantages
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig
+from ballbot_train.learning.settings import number
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)
 class PpoConfig(ModelFreeConfig):
     """Settings of `Ppo`."""
 
-    gae_lambda: float = 0.98
+    gae_lambda: float = number(0.98, 0, 1)
     """λ of the advantages."""
     relative_advantages: bool = True
     """Divide advantages by the cost to go, as regret is."""
     relative_values: bool = True
     """Divide the critic's errors by it too."""
-    final_std: float = 0.03
+    final_std: float = number(0.03, above=0)
     """Deviation at the end; it falls geometrically."""
     backwards: bool = False
     """Learn from the goal backwards; see `curricula`."""
-    imitation_weight: float = 0.1
+    imitation_weight: float = number(0.1, 0)
     """Of the expert's likelihood after cloning; falls to 0."""
 
 

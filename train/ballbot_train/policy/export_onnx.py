@@ -19,9 +19,9 @@ from ballbot_gym import files
 from ballbot_gym.lazy import imports_of, need
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
-from ballbot_train.policy import PolicyNetwork, load_network
-from ballbot_train.policy_files import OBSERVATION_VERSION, PolicyError, read_description, weights_digest
-from ballbot_train.weights import own_defaults
+from ballbot_train.policy.files import OBSERVATION_VERSION, PolicyError, read_description, weights_digest
+from ballbot_train.policy.network import PolicyNetwork, load_network
+from ballbot_train.policy.weights import own_defaults
 
 with imports_of(__name__):
     import torch

@@ -9,13 +9,16 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import casadi
 import numpy as np
-import torch
 
 from ballbot_gym.codegen import OPERATIONS
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.tasks.symmetry import REACH
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy.network import PolicyNetwork
+
+with imports_of(__name__):
+    import casadi
+    import torch
 
 _SHARED = {
     **OPERATIONS,

@@ -22,7 +22,7 @@ from ballbot_gym.tasks.symmetry import FRAMES, Frame
 OBSERVATION_VERSION = 1
 """Raised whenever what any task observes changes, so that older policies are refused instead of misled."""
 
-SHIPPED = Path(__file__).parent / "policies"
+SHIPPED = Path(__file__).parent.parent / "policies"
 """Policies that come with the package, as TASK-LEARNER.json and .safetensors, or TASK-ROBOT-LEARNER for other robots."""
 
 BEST = {"stabilize": "shac", "turn": "shac", "orbit": "ppo", "weave": "shac"}

@@ -24,14 +24,14 @@ from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import REACH, Route
-from ballbot_train.policy_files import (
+from ballbot_train.policy.files import (
     OBSERVATION_VERSION,
     PolicyError,
     PolicySpec,
     paths_of,
     read_description,
 )
-from ballbot_train.weights import checked, linear_layers, own_precision
+from ballbot_train.policy.weights import checked, linear_layers, own_precision
 
 with imports_of(__name__):
     import safetensors

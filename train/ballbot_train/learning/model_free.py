@@ -25,42 +25,47 @@ from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.sb3 import BallbotVecEnv
+from ballbot_train.learning.settings import MOST, MOST_ENVS, Settings, check_memory, number
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)
-class ModelFreeConfig:
+class ModelFreeConfig(Settings):
     """Settings that PPO and SAC share."""
 
-    iterations: int = 400
+    iterations: int = number(400, 1, MOST)
     """Iterations of `num_envs * num_steps` env steps."""
-    evaluations: int = 20
+    evaluations: int = number(20, 1, MOST)
     """Evaluations, at equal distances."""
-    num_envs: int = 512
+    num_envs: int = number(512, 1, MOST_ENVS)
     """Envs that are stepped together."""
-    num_steps: int = 96
+    num_steps: int = number(96, 1, 10**6)
     """Control steps of each env per iteration."""
-    episode_seconds: float = 8.0
+    episode_seconds: float = number(8.0, 0)
     """Duration in training, s. The rest is bootstrapped."""
-    short_episodes: tuple[float, float] = (0.0, 0.6)
+    short_episodes: tuple[float, float] = number((0.0, 0.6), 0)
     """Share of the episodes that is cut, and after how many s."""
-    gamma: float = 0.99
+    gamma: float = number(0.99, 0, 1)
     """Discount per control step of 0.02 s."""
-    final_gamma: float = 0.995
+    final_gamma: float = number(0.995, 0, 1)
     """Discount at the end; 1 less it falls geometrically."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = number((64, 64), 1, 2**14)
     """Units of hidden layers."""
     symmetry: Symmetry = "none"
     """What the actor keeps of the task's symmetry."""
-    learning_rate: float = 2e-3
+    learning_rate: float = number(2e-3, above=0)
     """Learning rate; it falls linearly."""
-    final_learning_rate_fraction: float = 0.05
+    final_learning_rate_fraction: float = number(0.05, 0)
     """That at the end, as a fraction."""
-    batch_size: int = 3072
+    batch_size: int = number(3072, 1, MOST)
     """Env steps per gradient step."""
-    std: float = 0.2
+    std: float = number(0.2, above=0)
     """Standard deviation of actions in ±1 at the start."""
+
+    def check(self) -> None:
+        super().check()
+        check_memory(self.num_envs, self.num_steps)
 
 
 _REWARD_SCALE = 0.02  # of rewards that pay for living

@@ -1,7 +1,7 @@
 """Where work is done: in this process, in processes of this machine, or on the nodes of a Ray cluster.
 
-A task gets its arguments and nothing else, so a worker needs no file of this machine. Jobs of `jobs`, trials of
-`learning.tuning` and missing optima are tasks.
+A task gets its arguments and nothing else, so a worker needs no file of this machine. Jobs of `jobs` and missing
+optima are tasks.
 """
 
 import itertools

@@ -28,10 +28,11 @@ from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, highest_value
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, seen_in
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, seen_in
+from ballbot_train.learning.settings import MOST, number
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import Mirrors
+from ballbot_train.policy.files import Mirrors
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,13 @@ class SacConfig(ModelFreeConfig):
     """What actor and critics keep of the task's symmetry."""
     products: bool = False
     """Critics see products of all pairs of inputs."""
-    gradient_steps: int = 16
+    gradient_steps: int = number(16, 1, MOST)
     """Gradient steps per control step of all envs."""
-    n_steps: int = 8
+    n_steps: int = number(8, 1, MOST)
     """Steps that a target looks ahead."""
-    buffer_size: int = 64_000
+    buffer_size: int = number(64_000, 1, 10**8)
     """Own env steps that are kept."""
-    target_entropy: float = -4.0
+    target_entropy: float = number(-4.0)
     """Entropy that the coefficient is tuned to, nats."""
 
 

@@ -38,32 +38,33 @@ from ballbot_train.learning.actors import RoutedSymmetry, actor_for
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.learning.settings import MOST, Settings, number
+from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass(frozen=True)
-class DaggerConfig:
+class DaggerConfig(Settings):
     """Settings of `Dagger`."""
 
-    iterations: int = 60
+    iterations: int = number(60, 1, MOST)
     """Number of iterations."""
-    gathering_iterations: int = 40
+    gathering_iterations: int = number(40, 0, MOST)
     """First of them that gather samples; 0: clone --demos."""
-    evaluations: int = 10
+    evaluations: int = number(10, 1, MOST)
     """Evaluations, at equal distances."""
-    episodes_per_iteration: int = 512
+    episodes_per_iteration: int = number(512, 1, MOST)
     """Episodes of a gathering iteration, of two optima each."""
-    label_seconds: float = 5.0
+    label_seconds: float = number(5.0, 0)
     """Part of an optimum that becomes samples, s."""
     backoff: Backoff = Backoff(grip=EXECUTED.grip)
     """What optima keep from their limits."""
-    gradient_steps: int = 1500
+    gradient_steps: int = number(1500, 1, MOST)
     """Gradient steps per iteration."""
-    batch_size: int = 1024
+    batch_size: int = number(1024, 1, MOST)
     """Samples per gradient step."""
-    learning_rate: float = 3e-3
+    learning_rate: float = number(3e-3, above=0)
     """Learning rate; it falls along half a cosine."""
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: tuple[int, ...] = number((128, 128), 1, 2**14)
     """Units of hidden layers."""
     symmetry: RoutedSymmetry = "none"
     """What the actor keeps of the task's symmetry."""

@@ -9,26 +9,29 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-import casadi
 import numpy as np
-import torch
 
 from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.feedback.kalman import SensorFilter
 from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import dynamics, files, sensors
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
-from ballbot_train.console import printable
-from ballbot_train.onnx_export import metadata
-from ballbot_train.policy import PolicyController, PolicyNetwork, load_network
-from ballbot_train.policy_files import PolicyError, PolicySpec
-from ballbot_train.report.page import render
-from ballbot_train.report.printed import c_function, c_number, layers_of, policy_function
-from ballbot_train.weights import own_defaults
+from ballbot_train.policy.export_onnx import metadata
+from ballbot_train.policy.files import PolicyError, PolicySpec
+from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_network
+from ballbot_train.policy.printed import c_function, c_number, layers_of, policy_function
+from ballbot_train.policy.weights import own_defaults
+from ballbot_train.work.console import printable
+from ballbot_train.work.templates import render
+
+with imports_of(__name__):
+    import casadi
+    import torch
 
 LQR = "lqr"
 """What is exported by this name is LQR, and no policy's file."""
@@ -40,6 +43,7 @@ LARGEST_ERROR = 1e-5
 """Of an action in the file's own test; float32 differs from Python by less."""
 
 _TEST_STEPS = 16
+_TEMPLATE = Path(__file__).parent / "assets" / "controller.c.j2"
 
 
 @own_defaults()
@@ -94,7 +98,7 @@ def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
 def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool, prefix: str) -> str:
     spec, params, networks = network.spec, named_robot(robot), layers_of(network)
     source = render(
-        "controller.c.j2",
+        _TEMPLATE,
         prefix=prefix,
         # lines of a C comment, which no text from a file can end
         about=printable("\n".join(f"{name}: {value}" for name, value in about.items())).replace("*", "×"),
