@@ -71,6 +71,9 @@ def controllers_by_robot(
     if unused and registry.is_file(unused[0]):
         made_for = registry.made_for(unused[0])
         raise ValueError(f"{unused[0]} was made for {made_for}, which is none of {', '.join(tasks)}")
+    for task in tasks if unused else ():
+        if hint := registry.of_other_robot(unused[0], make_task(task, robots[0])):
+            raise ValueError(f"unknown controller {unused[0]} for the robot {robots[0]}; {hint}")
     check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
     return chosen
 
