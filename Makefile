@@ -31,9 +31,9 @@ pytest: $(VENV)/installed
 test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
 
-# the submissions that lie beside rows of the leaderboard
+# the submissions that lie beside rows of the leaderboard; with RECORDINGS=FOLDER also those of releases, downloaded there
 verify: $(VENV)/installed
-	$(BIN)/pytest tests/test_submissions.py -k "beside or row"
+	BALLBOT_RECORDINGS=$(RECORDINGS) $(BIN)/pytest tests/test_submissions.py -k "beside or row"
 
 # one page with all figures of speed, beside those of the last page of another commit
 bench: $(VENV)/installed
@@ -135,7 +135,7 @@ release: $(VENV)/installed
 
 # Ray clusters of two nodes on this machine, with nodes that are killed
 ray: $(VENV)/installed
-	$(INSTALL) -e ".[ray,tune]"
+	$(INSTALL) -e ".[ray]"
 	$(BIN)/pytest tests/test_ray.py
 
 # the optima that the package ships, computed anew

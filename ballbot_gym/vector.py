@@ -27,12 +27,12 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
+from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.sensors import check_observation, observation_space

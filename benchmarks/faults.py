@@ -31,7 +31,7 @@ from ballbot_gym.lazy import load
 from ballbot_train import cli
 from ballbot_train.commands import COMMANDS as COMMAND_ENTRIES
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy_files import SHIPPED
+from ballbot_train.policy.files import SHIPPED
 
 _TIMES = {"plan_seconds", "step_seconds"}  # columns that no two runs share
 _LIMIT = 900.0  # s, after which a command hangs
@@ -82,19 +82,6 @@ def _fresh(out: Path) -> Made:
     return {"fresh.csv": (out / "fresh.csv").read_text()}
 
 
-def _search(out: Path) -> Made:
-    """How many trials a search has, and what that one reached whose settings are the learner's own.
-
-    It is the first that begins. Where it is killed, it begins again after others.
-    """
-    import optuna
-
-    study = optuna.load_study(study_name="tune", storage=f"sqlite:///{out.absolute()}/study.db")
-    trials = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
-    (own,) = (trial for trial in trials if trial.params == study.trials[0].system_attrs["fixed_params"])
-    return {"trials": len(trials), "own": {key: value for key, value in own.user_attrs.items() if key != "cpu_minutes"}}
-
-
 def _policy(out: Path) -> Made:
     return {"weights": (out / "policy.safetensors").read_bytes()}
 
@@ -122,7 +109,6 @@ COMMANDS = {
     "transfer": _command(
         "transfer --tasks turn --controllers lqr --made-for paper rolling --episodes 20 --physics rk4", _episodes
     ),
-    "tune": _command("tune ppo --task turn --trials 3 --seeds 1 --env-steps 8192 --evaluations 2", _search),
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
     "bc": _train("dagger", "--iterations 6 --gathering-iterations 0 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(
@@ -131,7 +117,7 @@ COMMANDS = {
     "ppo": _train("ppo", _RL),
     "ppo from a policy": _train("ppo", f"{_RL} --start {SHIPPED / 'turn-dagger.json'}"),
     "sac": _train("sac", _RL),
-    "shac": _train("shac", "--iterations 8 --num-envs 4 --horizon 3"),
+    "apg": _train("apg", "--iterations 8 --num-envs 4 --episode-seconds 0.06"),
 }
 
 

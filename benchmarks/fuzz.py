@@ -137,8 +137,8 @@ def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]
 
 def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
-    from ballbot_train.policy import PolicyNetwork, load_policy, save_policy
-    from ballbot_train.policy_files import PolicyError, PolicySpec
+    from ballbot_train.policy.files import PolicyError, PolicySpec
+    from ballbot_train.policy.network import PolicyNetwork, load_policy, save_policy
 
     network = PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,)))
     path = save_policy(folder / "mine", network, {"measured": {"regret_mean": 0.1}})
@@ -151,8 +151,8 @@ def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
 
     from ballbot_gym.env import make_task
     from ballbot_gym.params import default_params
-    from ballbot_train.policy_files import PolicyError
-    from ballbot_train.saved_models import load_actor
+    from ballbot_train.policy.files import PolicyError
+    from ballbot_train.policy.saved_models import load_actor
 
     env = gymnasium.make("BallbotTurn-v0", physics="rk4")
     path = folder / "mine.zip"
@@ -173,7 +173,7 @@ def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, .
 
 
 def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_train import jobs
+    from ballbot_train.work import jobs
 
     config, name = {"episodes": 3, "policies": {"a": "b"}}, "config.json"
     jobs.claim(folder, config, name)
@@ -181,7 +181,7 @@ def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ..
 
 
 def _entries(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_train import jobs
+    from ballbot_train.work import jobs
 
     path = folder / "job.json"
     path.write_text(json.dumps([{"cost": 1.5}] * 9))
@@ -201,13 +201,12 @@ def _demos(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...
 def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
     from ballbot_gym.params import default_params
-    from ballbot_train import jobs
-    from ballbot_train.learning import training
-    from ballbot_train.learning.learners import shac
+    from ballbot_train.learning import apg, training
+    from ballbot_train.work import jobs
 
-    task, config = make_task("turn"), {"learner": "shac", "task": "turn"}
-    settings = shac.ShacConfig(iterations=2, evaluations=1, num_envs=2, horizon=2, hidden=(4,))
-    made = shac.Shac(task, default_params(), settings)
+    task, config = make_task("turn"), {"learner": "apg", "task": "turn"}
+    settings = apg.ApgConfig(iterations=2, evaluations=1, num_envs=2, episode_seconds=0.04, hidden=(4,))
+    made = apg.Apg(task, default_params(), settings)
     run = training._Run(made, task, config | {"settings": asdict(settings)}, folder / "run", False)
     run.score()
     run.save()
@@ -215,7 +214,7 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type
     def resume() -> None:
         jobs.unlock(folder / "run")
         training._Run(
-            shac.Shac(task, default_params(), settings),
+            apg.Apg(task, default_params(), settings),
             task,
             config | {"settings": asdict(settings)},
             folder / "run",

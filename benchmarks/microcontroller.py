@@ -20,8 +20,8 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_train.evaluation.controllers import FILTERED, make_controller, policy_path
-from ballbot_train.report.c_export import LQR, export_c
-from ballbot_train.report.printed import c_number
+from ballbot_train.policy.export_c import LQR, export_c
+from ballbot_train.policy.printed import c_number
 
 _STRICT = ("-std=c99", "-O2", "-Wall", "-Werror", "-ffunction-sections", "-fdata-sections")
 _ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard")

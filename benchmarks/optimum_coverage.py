@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
+from ballbot_baselines import Optimum, find_optimum
+from ballbot_baselines.optimum.guesses import ALL_GUESSES
 from ballbot_gym import files
 from ballbot_gym.params import default_params
 from ballbot_gym.paths import sides_passed
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train import jobs
+from ballbot_train.work import jobs
 
 _DETOURS = 3
 _SHORTEST = 5  # paths of the former search for slaloms

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from ballbot_gym import files
-from ballbot_train.provenance import commit_of, provenance
+from ballbot_train.work.provenance import commit_of, provenance
 
 _HERE = Path(__file__).parent
 _BUSY = 0.05  # share of the cores that others took

@@ -31,13 +31,13 @@ from ray.cluster_utils import Cluster
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.benchmark import Group, run_groups
-from ballbot_train.executors import Workers, completed
+from ballbot_train.evaluation.runner import Group, run_groups
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+from ballbot_train.work import jobs, shards
+from ballbot_train.work.executors import Workers, completed
 
 _NODE = {"object_store_memory": 100 * 2**20}
 _LOOPS = 1_000_000  # of a computing item, some tenths of a second

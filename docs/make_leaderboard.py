@@ -13,10 +13,10 @@ from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.verify import regret
-from ballbot_train.console import markdown
 from ballbot_train.evaluation import comparison, released
 from ballbot_train.evaluation.submissions import Entry, copies, read_entries
-from ballbot_train.policy_files import shipped_ways
+from ballbot_train.policy.files import shipped_ways
+from ballbot_train.work.console import markdown
 
 PAGE = Path(__file__).parent / "leaderboard.md"
 FILMS = Path(__file__).parent / "pictures" / "films"

@@ -25,7 +25,7 @@ _EXPECTED = (
     *("-Wno-unused-parameter", "-Wno-unused-function", "-Wno-unused-variable", "-Wno-unused-but-set-variable"),
     "-Wno-pass-failed",
 )
-"""What generated code may do: compute what nothing reads, and have loops without SIMD where the C library has no such sines."""
+"""What generated code may do: compute what nothing reads, and loop without SIMD where the C library has no such sines."""
 _ROBOTS = 37  # two whole blocks of lanes, and a part of one
 
 ROLLOUT = """

@@ -59,7 +59,7 @@ def random_policy(task, hidden=(8,), mirrors=False, **fields):
     """A small network for a task whose outputs are not those of its start; `mirrors` are all that the task has."""
     import torch
 
-    from ballbot_train.policy import PolicyNetwork, PolicySpec
+    from ballbot_train.policy.network import PolicyNetwork, PolicySpec
 
     if mirrors:
         fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)

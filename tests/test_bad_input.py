@@ -20,7 +20,7 @@ import safetensors.torch
 import torch
 from builders import result
 
-from ballbot_baselines.optimum import Backoff
+from ballbot_baselines import Backoff
 from ballbot_gym import BallbotEnv, certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
@@ -29,16 +29,17 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.vector import BallbotVectorEnv
-from ballbot_train import evaluate, jobs, load_policy
+from ballbot_train import evaluate, load_policy
 from ballbot_train.cli import _run
-from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
 from ballbot_train.learning import training
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
-from ballbot_train.learning.learners import LEARNERS, check_settings
-from ballbot_train.policy import PolicyNetwork, save_policy
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.work import jobs
 
 REFUSALS = (ValueError, TypeError, gymnasium.error.Error)
 """What a wrong call may raise."""
@@ -416,7 +417,7 @@ DEMOS = [
 
 
 def settings(learner, **changes):
-    return lambda folder: check_settings(replace(LEARNERS[learner].settings("stabilize"), **changes))
+    return lambda folder: replace(LEARNERS[learner].settings("stabilize"), **changes).check()
 
 
 def batch(**given):
@@ -482,11 +483,11 @@ BATCHES = [
 ]
 
 LEARNING = [
-    (settings("shac", iterations=-5), "iterations must be 1 to 1000000000, not -5"),
-    (settings("shac", num_envs=10**12), "num_envs must be 1 to 1048576"),
-    (settings("shac", learning_rate=math.nan), "learning_rate must be finite and positive, not nan"),
-    (settings("shac", horizon=10**9), "horizon must be 0 to 100000"),
-    (settings("shac", horizon=10**4, num_envs=10**5), "1000000000 env steps per iteration, and at most 100000000"),
+    (settings("apg", iterations=-5), "iterations must be 1 to 1000000000, not -5"),
+    (settings("apg", num_envs=10**12), "num_envs must be 1 to 1048576"),
+    (settings("apg", learning_rate=math.nan), "learning_rate must be finite and positive, not nan"),
+    (settings("dagger", gathering_iterations=-1), "gathering_iterations must be 0 to 1000000000, not -1"),
+    (settings("ppo", num_steps=10**4, num_envs=10**5), "1000000000 env steps per iteration, and at most 100000000"),
     (settings("ppo", std=0.0), "std must be finite and positive, not 0.0"),
     (settings("ppo", gamma=1.5), "gamma must be 0 to 1, not 1.5"),
     (settings("ppo", imitation_weight=math.inf), "imitation_weight must be finite"),
@@ -558,10 +559,15 @@ TYPED = [
         "frames; give another speed or fps",
     ),
     ("train dance", "unknown learner dance; known: dagger, ppo"),
-    ("train shac --demos x", "shac uses no demonstrations"),
+    ("train apg --demos x", "apg does not support demonstrations; train with dagger or ppo or sac"),
+    ("train shac --horizon 0", "`shac` is now `apg`: write `ballbot train apg`, without --horizon 0"),
+    ("train sac --history 2", "sac does not support a history (--history); train with apg or dagger or ppo"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
     ("evaluate shac --fresh 0", "the number of fresh episodes must be 1 to 1,000,000, not 0"),
+    ("evaluate shac --optima 11", "give --optima with --fresh"),
+    ("evaluate shac --fresh 10 --physics bullet", "leave out --physics"),
+    ("evaluate shac --episodes 201", "episodes must be 1 to 200, not 201"),
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
@@ -569,7 +575,7 @@ TYPED = [
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),
-    ("train shac --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
+    ("train apg --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
     ("evaluate dagger --fresh 10", "unknown controller dagger"),  # Stabilize has none
     ("replay stabilize turn", "give one task"),
     ("export lqr", "lqr is an expert"),
@@ -597,4 +603,4 @@ def test_what_is_typed_wrong_ends_with_a_message_and_a_status_and_writes_nothing
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_the_settings_tuned_for_every_task_make_sense(learner):
     for name in TASK_NAMES:
-        check_settings(LEARNERS[learner].settings(name))
+        LEARNERS[learner].settings(name).check()

@@ -4,14 +4,15 @@ import math
 import numpy as np
 import pytest
 from builders import FunctionController
+from builders import result as certified_result
 
-from ballbot_baselines.optimum import find_optimum
-from ballbot_baselines.recovery import largest_leans
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum.recovery import largest_leans
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train.evaluation import basins
+from ballbot_train.evaluation import basins, runner
 from ballbot_train.report import figures
 
 LEAN_RATE = 6  # its index in a state
@@ -63,19 +64,30 @@ def bounds():
     return {name: np.concatenate([right, -right]) for name in basins.AXES}
 
 
-def entry(i, j, recovered, axis="speed"):
-    return {"axis": axis, "controller": "lqr", "i": i, "j": j, "recovered": recovered}
+POINTS = 5
+
+
+def cells_and_results(bounds, recovered):
+    """All cells of all maps of 5 points, and results of LQR in which it recovers from some, (axis, i, j)."""
+    cells = {name: np.argwhere(np.ones((POINTS, POINTS))) for name in bounds}
+    results = [
+        certified_result(controller="lqr", episode=k, success=(name, i, j) in recovered, told={"axis": name})
+        for name in bounds
+        for k, (i, j) in enumerate(cells[name].tolist())
+    ]
+    return cells, results, ["lqr"], POINTS
 
 
 def test_only_states_that_may_be_recoverable_are_run_and_only_half_of_them(bounds):
-    work = basins.cell_jobs(bounds, ["lqr"], 5, "rk4")
-    cells = {cell for job in work for cell in job.items if job.arguments[0] == "speed"}
-    assert cells == {(i, j) for i in (2, 3, 4) for j in (1, 2, 3)}  # leans −75, −37.5, 0, 37.5, 75
+    cells = basins.cells_of(bounds, POINTS)["speed"]
+    assert {(i, j) for i, j in cells.tolist()} == {
+        (i, j) for i in (2, 3, 4) for j in (1, 2, 3)
+    }  # leans −75 to 75 by 37.5
 
 
 def test_a_state_from_which_a_controller_recovers_is_recoverable(bounds):
-    found = [entry(2, 2, True), entry(3, 4, True), entry(4, 3, False)]
-    basin = basins.maps_of(bounds, found, ["lqr"], 5)[0]
+    found = {("speed", 2, 2), ("speed", 3, 4)}
+    basin = basins.maps_of(bounds, *cells_and_results(bounds, found))[0]
     assert basin.recovered["lqr"].sum() == 3
     assert basin.recovered["lqr"][3, 4]
     assert basin.recovered["lqr"][1, 0]  # the same, turned by 180°
@@ -85,14 +97,14 @@ def test_a_state_from_which_a_controller_recovers_is_recoverable(bounds):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_lqr_recovers_upright_and_slow_but_not_fast(robot, bounds, tmp_path):
-    work = [job for job in basins.cell_jobs(bounds, ["lqr"], 3, "rk4", robot) if job.arguments[0] == "speed"]
-    done = basins.jobs.run(work, tmp_path, 1, lambda name, count: None)
-    recovered = {(e["i"], e["j"]): e["recovered"] for entries in done for e in entries}
+    cells = {"speed": basins.cells_of(bounds, 3)["speed"]}
+    done = runner.run_groups(basins.groups_of(cells, ["lqr"], 3, "rk4", robot), 0, tmp_path, 1)
+    recovered = {tuple(cells["speed"][result.episode].tolist()): result.success for result in done}
     assert recovered == {(1, 1): True, (2, 1): False}  # 0 and 15 m/s
 
 
 def test_maps_are_written_and_drawn(bounds, tmp_path):
-    maps = basins.maps_of(bounds, [entry(2, 2, True), entry(2, 1, True, "lean rate")], ["lqr"], 5)
+    maps = basins.maps_of(bounds, *cells_and_results(bounds, {("speed", 2, 2), ("lean rate", 2, 1)}))
     basins.write(maps, {"commit": "none", "robot": "rolling"}, tmp_path)
     written = json.loads((tmp_path / "basins.json").read_text())
     assert written["rows"][0]["recovered"] == pytest.approx(3 / 30)
@@ -104,7 +116,9 @@ def test_maps_are_written_and_drawn(bounds, tmp_path):
 
 
 def test_the_command_maps_what_is_recoverable(tmp_path, typed, monkeypatch):
-    monkeypatch.setattr("ballbot_baselines.recovery.largest_leans", lambda *problem: np.full(31, math.radians(40)))
+    monkeypatch.setattr(
+        "ballbot_baselines.optimum.recovery.largest_leans", lambda *problem: np.full(31, math.radians(40))
+    )
     ended, printed = typed("basins", "--controllers", "lqr", "--points", 3, "--physics", "rk4", "--workers", 1)
     assert (ended, "Share of the recoverable states, 3 × 3 a map" in printed) == (0, True), printed
     assert {path.name for path in (tmp_path / "runs" / "basins").iterdir()} == {

@@ -14,9 +14,9 @@ from ballbot_gym.rollout import rollout
 from ballbot_gym.sensors import SCALE
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.policy import PolicyController, save_policy
-from ballbot_train.policy_files import SHIPPED
-from ballbot_train.report.c_export import LARGEST_ERROR, LQR, export_c
+from ballbot_train.policy.export_c import LARGEST_ERROR, LQR, export_c
+from ballbot_train.policy.files import SHIPPED
+from ballbot_train.policy.network import PolicyController, save_policy
 
 COMPILER = machine_code.compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")

@@ -109,10 +109,9 @@ def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, ho
 @pytest.mark.parametrize(
     ("arguments", "option", "help"),
     [
-        (("train", "shac", "--taks", "turn"), "--task", "ballbot train shac --help"),
+        (("train", "apg", "--taks", "turn"), "--task", "ballbot train apg --help"),
         (("train", "--taks", "turn"), "", "ballbot train --help"),
-        (("train", "shac", "--task"), "--task", "ballbot train shac --help"),
-        (("tune", "ppo", "--tiral", "3"), "--trials", "ballbot tune --help"),
+        (("train", "apg", "--task"), "--task", "ballbot train apg --help"),
         (("benchmark", "--taks", "turn"), "--tasks", "ballbot benchmark --help"),
     ],
 )
@@ -174,7 +173,7 @@ def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, me
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     packaged = certified.path_of(make_task("turn")).read_bytes()
-    certification = importlib.import_module("ballbot_baselines.certification")
+    certification = importlib.import_module("ballbot_baselines.optimum.certification")
     solved, again = [], []
     find_optimum = certification.find_optimum
 

@@ -5,18 +5,14 @@ import pytest
 import torch
 from test_examples import load
 
-from ballbot_baselines import find_optimum, regret
-from ballbot_baselines.batched import solves
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optima, find_optimum, regret
 from ballbot_gym import BallbotEnv, step_code
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.transition import outcome
+from ballbot_train.learning.apg import ApgConfig
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.learners.shac import ShacConfig
 
 STEPS = 16
 CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
@@ -129,15 +125,17 @@ def test_an_optimum_may_start_later_in_the_episode(task, params):
     assert late.cost == pytest.approx(task.control_dt * np.sum(rates), rel=1e-9)
 
 
-def test_batches_of_optima_leave_a_task_with_a_clock_to_find_optimum(task, params):
-    assert not solves(task, params)
+def test_optima_of_a_task_with_a_clock_are_found_one_by_one(task, params):
+    x, c = task.sample(np.random.default_rng(0), params)
+    (optimum,) = find_optima(task, params, x[None], c[None])
+    assert optimum.cost == find_optimum(task, params, x, c).cost
 
 
-def test_shac_through_whole_episodes_pays_what_the_episodes_cost(task, params):
-    with pytest.raises(ValueError, match="shac with --horizon 0"):
-        LEARNERS["shac"].make(task, params, ShacConfig(), 0)
-    settings = ShacConfig(horizon=0, iterations=2, num_envs=4, episode_seconds=0.4, hidden=(8,))
-    learner = LEARNERS["shac"].make(task, params, settings, 0)
+def test_apg_pays_what_the_episodes_cost_and_dagger_says_that_it_cannot(task, params):
+    with pytest.raises(ValueError, match="dagger does not support tasks whose cost or goal depends on the time"):
+        LEARNERS["dagger"].make(task, params, LEARNERS["dagger"].settings(""), 0)
+    settings = ApgConfig(iterations=2, num_envs=4, episode_seconds=0.4, hidden=(8,))
+    learner = LEARNERS["apg"].make(task, params, settings, 0)
     batch, state = learner._batch, learner._batch.state
     costs, _ = learner._episodes()
     batch.state = state

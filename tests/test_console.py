@@ -9,8 +9,8 @@ import time
 import pytest
 from rich.console import Console
 
-from ballbot_train import console
-from ballbot_train.console import PlainConsole
+from ballbot_train.work import console
+from ballbot_train.work.console import PlainConsole
 
 
 def test_progress_into_a_pipe_is_a_line_for_every_bar_that_is_not_full(monkeypatch):

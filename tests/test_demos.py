@@ -12,16 +12,16 @@ import minari
 import numpy as np
 import pytest
 
-from ballbot_baselines import trajopt
-from ballbot_baselines.trajopt import EXECUTED
+from ballbot_baselines.feedback import trajopt
+from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main
 from ballbot_train.learning.datasets import command_of, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, Expert, record, write_demos
-from ballbot_train.policy import load_policy
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.policy.files import shipped_policies
+from ballbot_train.policy.network import load_policy
 
 
 def make(out, **changes):

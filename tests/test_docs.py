@@ -17,11 +17,10 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands import COMMANDS
 from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.submissions import read_entries
-from ballbot_train.executors import Workers
-from ballbot_train.learning import training
-from ballbot_train.learning.learners import model_free
-from ballbot_train.policy_files import SHIPPED, shipped_ways, way_of
+from ballbot_train.learning import model_free, training
+from ballbot_train.policy.files import SHIPPED, shipped_ways, way_of
 from ballbot_train.report import figures
+from ballbot_train.work.executors import Workers
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -29,7 +28,7 @@ CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where 
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
     "dagger": "--iterations 1 --episodes-per-iteration 4 --gradient-steps 5",
     "ppo": "--iterations 1 --num-envs 64 --num-steps 48",
-    "shac": "--iterations 1 --num-envs 8 --horizon 4",
+    "apg": "--iterations 1 --num-envs 8 --episode-seconds 0.1",
 }
 OTHERS = {"--help", "--version", "--env-id"}
 """Options on pages that are not listed by the help of a command: of all commands, and of another program."""
@@ -55,7 +54,7 @@ def test_python_runs(page, tmp_path, monkeypatch):
 
 
 def test_the_task_that_is_added_can_be_certified(interpreted):
-    from ballbot_baselines.optimum import find_optimum
+    from ballbot_baselines import find_optimum
     from ballbot_gym.certified.cache import episode
 
     names = {"__name__": "sprint"}

@@ -20,13 +20,13 @@ from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train import console
-from ballbot_train.evaluation import benchmark, evaluate
+from ballbot_train.evaluation import controllers, evaluate, runner
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, portable
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.policy import PolicyNetwork, save_policy
-from ballbot_train.policy_files import PolicySpec, shipped_policies
+from ballbot_train.policy.files import PolicySpec, shipped_policies
+from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.work import console
 
 
 def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():
@@ -45,7 +45,7 @@ def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path):
     def run():
-        return benchmark.run_groups([benchmark.Group("stabilize", "lqr", "rk4")], 7, tmp_path, 1, record=True)
+        return runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 7, tmp_path, 1, record=True)
 
     first = run()
     path, last = sorted(tmp_path.rglob("unfinished/*.json"))
@@ -61,7 +61,7 @@ def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_p
 
 def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
     def rows(out, workers):
-        results = benchmark.run_groups([benchmark.Group("stabilize", "lqr", "rk4")], 7, out, workers, record=True)
+        results = runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 7, out, workers, record=True)
         return [replace(row, plan_ms_median=0, step_us_median=0) for row in leaderboard(results)]
 
     assert rows(tmp_path / "a", 1) == rows(tmp_path / "b", 2)
@@ -136,22 +136,22 @@ def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
 
 def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
     path = str(save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {}))
-    chosen = benchmark.controllers_of(["stabilize", "turn"], ["lqr", path])
+    chosen = controllers.controllers_of(["stabilize", "turn"], ["lqr", path])
     assert chosen == {"stabilize": ["lqr"], "turn": ["lqr", path]}
-    assert benchmark.controllers_of(["stabilize", "turn"], [path]) == {"turn": [path]}
-    assert set(benchmark.policy_digests(chosen)) == {f"turn/{path}"}
+    assert controllers.controllers_of(["stabilize", "turn"], [path]) == {"turn": [path]}
+    assert set(controllers.policy_digests(chosen)) == {f"turn/{path}"}
     with pytest.raises(ValueError, match="which is none of stabilize"):
-        benchmark.controllers_of(["stabilize"], [path])
+        controllers.controllers_of(["stabilize"], [path])
 
 
 def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
-    for task, names in benchmark.controllers_of(list(TASKS)).items():
+    for task, names in controllers.controllers_of(list(TASKS)).items():
         assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
 IMPORTS = [
     ("import ballbot_baselines", []),
-    ("import ballbot_train.evaluation.benchmark, ballbot_train.evaluation.comparison", []),
+    ("import ballbot_train.evaluation.runner, ballbot_train.evaluation.comparison", []),
     ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
     ("from ballbot_train import evaluate, shipped_policies", []),
     ("evaluate(Idle(), 'stabilize', 1, 'rk4')", []),

@@ -1,6 +1,8 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
@@ -42,3 +44,12 @@ def test_learning_curves_are_of_all_seeds_of_a_folder(capsys, tmp_path):
     load("learning_curves").main((tmp_path / "runs",), tmp_path / "curves.png")
     assert "median 200.00%, worst 400.00% of 2 seeds" in capsys.readouterr().out
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_search_trains_with_proposed_settings_and_continues_its_study(capsys, tmp_path):
+    pytest.importorskip("optuna")
+    tiny = "--iterations 1 --evaluations 1 --num-envs 4 --batch-size 16 --hidden 4 --test-episodes 1 --validation-episodes 2"
+    for _ in range(2):  # the second time there is nothing left to do
+        load("tune").main("turn", 1, 1, f"{tiny} --episode-seconds 1", tmp_path)
+    assert capsys.readouterr().out.count("the best, trial 0, costs") == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["study.db", "trial-0"]

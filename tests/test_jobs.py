@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from ballbot_train import jobs
-from ballbot_train.executors import WorkerError
-from ballbot_train.provenance import commit_of
+from ballbot_train.work import jobs
+from ballbot_train.work.executors import WorkerError
+from ballbot_train.work.provenance import commit_of
 
 
 def squares(log, items):
@@ -68,7 +68,7 @@ def lives(process):
 def test_workers_end_with_a_run_that_is_killed(tmp_path):
     (tmp_path / "endless.py").write_text(ENDLESS)
     code = (
-        "import sys; from pathlib import Path; sys.path.insert(0, '.'); import endless; from ballbot_train import jobs\n"
+        "import sys; from pathlib import Path; sys.path.insert(0, '.'); import endless; from ballbot_train.work import jobs\n"
         "work = [jobs.Job(str(i), endless.work, ('.',), (0,)) for i in range(2)]\n"
         "if __name__ == '__main__': jobs.run(work, Path('out'), 2, lambda group, count: None)"
     )
@@ -120,7 +120,7 @@ def test_the_files_of_a_claim_keep_facts_that_are_not_compared(tmp_path):
 HOLDING = """
 import sys
 from pathlib import Path
-from ballbot_train import jobs
+from ballbot_train.work import jobs
 
 jobs.claim(Path(sys.argv[1]), {"seed": 1})
 print("claimed", flush=True)
@@ -219,3 +219,29 @@ def test_of_nested_settings_only_those_that_differ_are_named(tmp_path):
     held = {"seed": 1, "settings": {"gamma": 0.99, "hidden": [64, 64]}}
     with pytest.raises(ValueError, match=r"holds a run of settings gamma 0\.99, not 0\.98; give another --out"):
         jobs.check_same(held, {"seed": 1, "settings": {"gamma": 0.98, "hidden": (64, 64)}}, tmp_path, "a run")
+
+
+WITHOUT_GUARD = """
+from ballbot_train.work import jobs
+from pathlib import Path
+from test_jobs import ignore, job, squares
+
+if GUARD:
+    jobs.run([job(squares, Path("log"), range(i, i + 2), f"job{i}") for i in (0, 2)], Path("out"), 2, ignore)
+"""
+
+
+@pytest.mark.parametrize("guard", ["True", "__name__ == '__main__'"])
+def test_a_script_without_a_guard_learns_that_it_needs_one(guard, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(WITHOUT_GUARD.replace("GUARD", guard))
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    ended = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    if guard == "True":
+        assert 'must do its work under if __name__ == "__main__":' in ended.stderr.splitlines()[-1]
+        assert "out of memory" not in ended.stderr.splitlines()[-1]
+    else:
+        assert ended.returncode == 0, ended.stderr

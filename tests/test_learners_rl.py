@@ -11,12 +11,13 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
+from ballbot_train.learning import model_free, ppo, sac
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
-from ballbot_train.learning.learners.sac import demos_in_frame
-from ballbot_train.policy import PolicyNetwork, load_network, save_policy
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.sac import demos_in_frame
+from ballbot_train.policy.files import shipped_policies
+from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 
 SHARED = {"gamma": 0.995, "final_gamma": 0.999, "iterations": 3, "num_envs": 4, "hidden": (16, 8)}
 RELATIVE = {"relative_advantages": False, "relative_values": False}

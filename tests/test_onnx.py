@@ -10,9 +10,9 @@ from ballbot_gym.engines import default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import named_robot
 from ballbot_train.commands.export import export
-from ballbot_train.onnx_export import export_onnx
-from ballbot_train.policy import PolicyController, PolicyNetwork, load_policy, save_policy
-from ballbot_train.policy_files import SHIPPED, PolicySpec, read_description, track_in
+from ballbot_train.policy.export_onnx import export_onnx
+from ballbot_train.policy.files import SHIPPED, PolicySpec, read_description, track_in
+from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
 
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 

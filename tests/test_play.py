@@ -12,8 +12,8 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_train.play.simulation import LARGEST_PUSH, Playground
-from ballbot_train.policy_files import BEST, SHIPPED
+from ballbot_train.policy.files import BEST, SHIPPED
+from ballbot_train.report.simulation import LARGEST_PUSH, Playground
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
 

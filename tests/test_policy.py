@@ -17,8 +17,8 @@ from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller, names
 from ballbot_train.evaluation.evaluate import evaluate
-from ballbot_train.policy import PolicyController, PolicyNetwork, load_policy, save_policy
-from ballbot_train.policy_files import BEST, PolicyError, PolicySpec, read_description, shipped_policies
+from ballbot_train.policy.files import BEST, PolicyError, PolicySpec, read_description, shipped_policies
+from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from ballbot_gym.env import make_task
-from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
-from ballbot_train.evaluation.benchmark import Group, run_groups
-from ballbot_train.executors import Workers, completed
-from ballbot_train.learning import tuning
+from ballbot_train.evaluation.runner import Group, run_groups
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+from ballbot_train.work import jobs, shards
+from ballbot_train.work.executors import Workers, completed
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.slow
@@ -113,12 +112,3 @@ def test_an_error_of_an_item_is_the_error_of_the_run(cluster, tmp_path):
     head, _ = cluster
     with pytest.raises(ValueError, match=r"^no such item$"):
         jobs.run([jobs.Job("job", refuses, (), (0, 1))], tmp_path, Workers(ray=head.address), lambda *_: None)
-
-
-def test_a_search_runs_its_trials_on_the_nodes(cluster, tmp_path):
-    head, _ = cluster
-    search = tuning.Search("ppo", "stabilize", (0,), 64, 1)
-    best = tuning.run(search, 3, tmp_path, Workers(2, head.address))
-    trials = tuning.open_study(search, tmp_path).trials
-    assert len(trials) == 3
-    assert best["validation_cost"] == min(trial.value for trial in trials if trial.state.name == "COMPLETE")

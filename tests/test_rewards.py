@@ -24,9 +24,9 @@ ENVS = 32
 def policies(task, params):
     """Policies by name: functions of state (8, B), observation (B, no) and a generator to actions (B, 2)."""
     pytest.importorskip("scipy")
-    from ballbot_baselines.lqr import discrete_lqr
-    from ballbot_train.policy import load_network
-    from ballbot_train.policy_files import shipped_policies
+    from ballbot_baselines.solvers.riccati import discrete_lqr
+    from ballbot_train.policy.files import shipped_policies
+    from ballbot_train.policy.network import load_network
 
     k, _ = discrete_lqr(Stabilize(), params, np.zeros(8), np.zeros(2), np.zeros(0))
     k = torch.as_tensor(k) / params.force_limit

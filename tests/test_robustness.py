@@ -7,7 +7,7 @@ import pytest
 from builders import stress_result as result
 
 from ballbot_gym.randomization import Randomization
-from ballbot_train.evaluation import benchmark, robustness
+from ballbot_train.evaluation import robustness, runner
 from ballbot_train.evaluation.results import leaderboard, summarize, write_results
 from ballbot_train.evaluation.robustness import NONE, STRESSES
 from ballbot_train.report import figures
@@ -24,12 +24,12 @@ def test_severity_0_is_no_disturbance_and_every_level_is_one(name):
 
 def run(stress, episodes, out, seed=0):
     groups = robustness.groups_of({"stabilize": ["lqr"]}, [stress], "rk4")
-    return benchmark.run_groups(groups, episodes, out, 1, seed)
+    return runner.run_groups(groups, episodes, out, 1, seed)
 
 
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     results = run("delay", 3, tmp_path)
-    plain = benchmark.run_groups([benchmark.Group("stabilize", "lqr", "rk4")], 3, tmp_path / "plain", 1)
+    plain = runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 3, tmp_path / "plain", 1)
     rows = leaderboard(results)
     assert [tuple(row.told.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballbot_baselines import certification, righting
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import Backoff, find_optimum
+from ballbot_baselines import Backoff, NmpcController, find_optimum
+from ballbot_baselines.optimum import certification
+from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import certified, dynamics
 from ballbot_gym.engines.bullet import BulletContactSimulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
@@ -24,9 +24,9 @@ from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
-from ballbot_train.evaluation.benchmark import controllers_by_robot
-from ballbot_train.policy import load_network, load_policy
-from ballbot_train.policy_files import PolicyError, PolicySpec, shipped_policies
+from ballbot_train.evaluation.controllers import controllers_by_robot
+from ballbot_train.policy.files import PolicyError, PolicySpec, shipped_policies
+from ballbot_train.policy.network import load_network, load_policy
 
 START = (0.0, 0.0, 0.2, -0.15, 0.5, -1.0, 0.3, -0.4)
 

@@ -14,8 +14,8 @@ from ballbot_train.evaluation import fresh
 from ballbot_train.learning import routing
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork
 
 TASK, PARAMS = make_task("weave"), default_params()
 
@@ -79,14 +79,14 @@ def test_a_learner_teaches_its_routes_first_and_keeps_them(monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
     monkeypatch.setattr(routing, "_DISTANCES", 1)
-    tiny = {"num_envs": 4, "horizon": 3, "iterations": 2, "hidden": (8,)}
-    settings = replace(LEARNERS["shac"].settings("weave"), symmetry="routes", **tiny)
-    learner = LEARNERS["shac"].make(TASK, PARAMS, settings, 0, None)
+    tiny = {"num_envs": 4, "episode_seconds": 0.06, "iterations": 2, "hidden": (8,)}
+    settings = replace(LEARNERS["apg"].settings("weave"), symmetry="routes", **tiny)
+    learner = LEARNERS["apg"].make(TASK, PARAMS, settings, 0, None)
     before = [part.clone() for part in learner.network.routes.parameters()]
     learner.iterate()
     taught = [part.clone() for part in learner.network.routes.parameters()]
     assert not any(torch.equal(a, b) for a, b in zip(before, taught, strict=True))
-    resumed = LEARNERS["shac"].make(TASK, PARAMS, settings, 0, None)
+    resumed = LEARNERS["apg"].make(TASK, PARAMS, settings, 0, None)
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     learner.iterate()
     resumed.iterate()

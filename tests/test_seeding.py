@@ -7,7 +7,6 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from ballbot_baselines import batched
 from ballbot_gym import seeding
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv
@@ -16,9 +15,9 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import BallbotVecEnv
-from ballbot_train.evaluation import evaluate, fresh
+from ballbot_train.evaluation import fresh, runner
 from ballbot_train.learning import demonstrations
-from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners import LEARNERS, dagger
 from ballbot_train.learning.rsl import RslVecEnv
 
 ENVS = 64
@@ -76,7 +75,7 @@ def test_trainings_with_neighbouring_seeds_share_no_start(name, starts, monkeypa
     def plan(*arguments, **options):
         raise Drawn
 
-    monkeypatch.setattr(batched, "find_optima", plan)
+    monkeypatch.setattr(dagger, "find_optima", plan)
     settings = LEARNERS[name].settings("stabilize")
     known = {field.name for field in fields(settings)}
     settings = replace(settings, **{key: value for key, value in SMALL.items() if key in known})
@@ -120,11 +119,11 @@ def test_sets_of_demonstrations_and_of_disturbed_episodes_share_no_seed(monkeypa
 
     def note(env, controller, seed, options):
         used[seed >= 1_000_000].add(seed)
-        raise evaluate.PlanError("none")
+        raise runner.PlanError("none")
 
-    monkeypatch.setattr(evaluate, "rollout", note)
+    monkeypatch.setattr(runner, "rollout", note)
     for seed in (0, 1):
-        evaluate.run_episodes(env, None, "none", "stabilize", range(200), seed)
+        runner.run_episodes(env, None, "none", "stabilize", range(200), seed)
     assert [len(seeds) for seeds in used.values()] == [200, 200]
     of = [demonstrations.DemoConfig(seed=seed, episodes=1000).episode_seed for seed in (0, 1)]
     assert not {of[0](i) for i in range(1000)} & {of[1](i) for i in range(1000)}

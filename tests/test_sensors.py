@@ -5,14 +5,13 @@ import copy
 import numpy as np
 import pytest
 
-from ballbot_baselines.kalman import StateFromSensors
+from ballbot_baselines import StateFromSensors
 from ballbot_gym import certified, dynamics, omni, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
-from ballbot_train.evaluation.benchmark import controllers_of
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import controllers_of, make_controller
 from ballbot_train.evaluation.evaluate import evaluate
 
 DT = 0.02

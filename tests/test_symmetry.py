@@ -9,8 +9,8 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import steady_orbit
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
+from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.network import PolicyNetwork
 
 MIRRORED = [(name, i) for name, kind in TASKS.items() for i in range(len(kind().mirrors))]
 

@@ -11,9 +11,9 @@ pytest.importorskip("torch")
 
 
 from ballbot_baselines import LqrController
-from ballbot_baselines.adaptive import AdaptiveNmpcController
-from ballbot_baselines.kalman import TrackFilter
-from ballbot_baselines.trajopt import cautious_trajopt
+from ballbot_baselines.feedback.adaptive import AdaptiveNmpcController
+from ballbot_baselines.feedback.kalman import TrackFilter
+from ballbot_baselines.feedback.trajopt import cautious_trajopt
 from ballbot_gym import certified
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
@@ -24,14 +24,13 @@ from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
-from ballbot_train.evaluation.benchmark import controllers_of
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import controllers_of, make_controller
 from ballbot_train.evaluation.fresh import as_batch_policy, evaluate_fresh
 from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started
-from ballbot_train.onnx_export import export_onnx
-from ballbot_train.policy import load_network, save_policy
-from ballbot_train.policy_files import PolicyError, read_description, shipped_policies, track_in
+from ballbot_train.policy.export_onnx import export_onnx
+from ballbot_train.policy.files import PolicyError, read_description, shipped_policies, track_in
+from ballbot_train.policy.network import load_network, save_policy
 
 
 def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import re
 import shlex
 import shutil
 import signal
@@ -14,35 +15,50 @@ import torch
 from builders import measured
 from resuming import goes_on_as_if_never_stopped, parameters
 
-from ballbot_baselines.optimum import Backoff
+from ballbot_baselines import Backoff
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import problem_digest
+from ballbot_gym.identity import problem_parts
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.train import Run, command_with, parse
-from ballbot_train.learning import training
+from ballbot_train.learning import apg, training
 from ballbot_train.learning.demonstrations import DemoConfig
-from ballbot_train.learning.learners import LEARNERS, shac
-from ballbot_train.policy_files import SHIPPED
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.files import SHIPPED
 
 # From a policy that does nothing, so that episodes end soon.
-SETTINGS = ["--task", "turn", "--iterations", 6, "--evaluations", 1, "--num-envs", 4, "--horizon", 3, "--hidden", 8]
+SETTINGS = [
+    "--task",
+    "turn",
+    "--iterations",
+    6,
+    "--evaluations",
+    1,
+    "--num-envs",
+    4,
+    "--episode-seconds",
+    0.06,
+    "--hidden",
+    8,
+]
 SETTINGS += ["--test-episodes", 3]
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
-    tiny = {"iterations": 4, "num_envs": 4, "horizon": 3, "hidden": (8,), "hard_fraction": 0.5}
-    config = replace(LEARNERS["shac"].settings(name), **tiny)
-    assert goes_on_as_if_never_stopped(lambda seed: shac.Shac(TASKS[name](), default_params(), config, seed))
+def test_apg_goes_on_from_its_state_as_if_never_stopped(name):
+    tiny = {"iterations": 4, "num_envs": 4, "episode_seconds": 0.06, "hidden": (8,)}
+    config = replace(LEARNERS["apg"].settings(name), **tiny)
+    assert goes_on_as_if_never_stopped(lambda seed: apg.Apg(TASKS[name](), default_params(), config, seed))
 
 
-def test_shac_starts_at_lqr_and_lowers_the_cost():
+def test_apg_starts_at_lqr_and_lowers_the_cost():
     """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
     task, params = TASKS["stabilize"](), default_params()
-    config = replace(LEARNERS["shac"].settings("stabilize"), iterations=10, num_envs=32, horizon=20, hidden=(32,))
-    learner = shac.Shac(task, params, config)
+    config = replace(
+        LEARNERS["apg"].settings("stabilize"), iterations=10, num_envs=32, episode_seconds=2.0, hidden=(32,)
+    )
+    learner = apg.Apg(task, params, config)
     before = training.score_and_validate(learner.network, task, episodes=1)
     assert before["certified/success"] > 0.5  # LQR within the limits of tanh
     for _ in range(config.iterations):
@@ -51,24 +67,21 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     assert after["certified/cost_ratio"] < 0.7 * before["certified/cost_ratio"]
 
 
-def test_shac_starts_from_a_policy_of_any_shape_and_robot_and_trains_its_critic_first():
+def test_apg_starts_from_a_policy_of_any_shape_and_robot():
     task, params = TASKS["turn"](), default_params()
-    config = shac.ShacConfig(iterations=41, num_envs=4, horizon=2, hidden=(8,))
-    donor = shac.Shac(task, params, config, 1)
-    learner = shac.Shac(task, params, replace(config, hidden=(9,)), 2, donor.network)
-    assert torch.equal(parameters(learner), parameters(donor))
-    for _ in range(40):
-        learner.iterate()  # only the critic learns
+    config = apg.ApgConfig(iterations=2, num_envs=4, episode_seconds=0.04, hidden=(8,))
+    donor = apg.Apg(task, params, config, 1)
+    learner = apg.Apg(task, params, replace(config, hidden=(9,)), 2, donor.network)
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
     donor.network.spec = replace(donor.network.spec, robot="rolling", task=replace(task, max_speed=3.0).problem())
-    assert shac.Shac(task, params, config, 2, donor.network).network.spec.robot == "paper"
+    assert apg.Apg(task, params, config, 2, donor.network).network.spec.robot == "paper"
 
 
-def test_a_setting_of_shac_that_would_do_nothing_says_so():
+def test_a_setting_of_apg_that_would_do_nothing_says_so():
     with pytest.raises(ValueError, match="needs margin_penalty above 0"):
-        LEARNERS["shac"].make(TASKS["stabilize"](), default_params(), shac.ShacConfig(margin_clearance=0.1), 0, None)
+        LEARNERS["apg"].make(TASKS["stabilize"](), default_params(), apg.ApgConfig(margin_clearance=0.1), 0, None)
 
 
 class Killed(BaseException):
@@ -77,18 +90,18 @@ class Killed(BaseException):
 
 def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    iterate = shac.Shac.iterate
+    iterate = apg.Apg.iterate
 
     def killed_after_four(self):
         if self.iteration == 4:
             raise Killed
         return iterate(self)
 
-    common = ["shac", "--threads", 1, *SETTINGS, "--validation-episodes", 4]
+    common = ["apg", "--threads", 1, *SETTINGS, "--validation-episodes", 4]
     assert typed("train", *common, "--out", whole)[0] == 0
     with monkeypatch.context() as patch:
         patch.setattr(training, "_CHECKPOINT_SECONDS", 0.0)
-        patch.setattr(shac.Shac, "iterate", killed_after_four)
+        patch.setattr(apg.Apg, "iterate", killed_after_four)
         with pytest.raises(Killed):
             typed("train", *common, "--out", killed)
     ended, printed = typed("train", *common, "--out", killed)
@@ -108,7 +121,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed, monkeypatch):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder(tmp_path, typed, monkeypatch, number):
-    iterate = shac.Shac.iterate
+    iterate = apg.Apg.iterate
 
     def interrupted(self):
         if self.iteration == 3:
@@ -116,8 +129,8 @@ def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder
         return iterate(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(shac.Shac, "iterate", interrupted)
-        ended, printed = typed("train", "shac", *SETTINGS, "--out", "a run")
+        patch.setattr(apg.Apg, "iterate", interrupted)
+        ended, printed = typed("train", "apg", *SETTINGS, "--out", "a run")
     assert (ended, "this continues where it stopped" in printed) == (130, True), printed
     shutil.copytree(tmp_path / "a run", tmp_path / "copy")
     words = shlex.split(printed.rpartition(": ")[2])
@@ -138,25 +151,25 @@ def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder
 
 def test_a_damaged_checkpoint_is_named(tmp_path):
     task, params = TASKS["stabilize"](), default_params()
-    config = shac.ShacConfig(iterations=1, evaluations=1, num_envs=2, horizon=2, hidden=(4,))
-    about = {"learner": "shac", "task": "stabilize"}
-    (tmp_path / "config.json").write_text(json.dumps(about | {"problem": problem_digest(task, params)}))
+    config = apg.ApgConfig(iterations=1, evaluations=1, num_envs=2, episode_seconds=0.04, hidden=(4,))
+    about = {"learner": "apg", "task": "stabilize"}
+    (tmp_path / "config.json").write_text(json.dumps(about | {"problem": problem_parts(task, params)}))
     for content in (b"", b"garbage", b"PK\x03\x04"):
         (tmp_path / "checkpoint.pt").write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
-            training.train(shac.Shac(task, params, config), task, about, tmp_path, resume=True)
+            training.train(apg.Apg(task, params, config), task, about, tmp_path, resume=True)
 
 
 @pytest.fixture
 def short_run(tmp_path, monkeypatch):
     """Trains for two iterations, each followed by an evaluation, without the measurement in PyBullet."""
     task, params = TASKS["stabilize"](), default_params()
-    config = shac.ShacConfig(iterations=2, evaluations=2, num_envs=2, horizon=2, hidden=(4,))
+    config = apg.ApgConfig(iterations=2, evaluations=2, num_envs=2, episode_seconds=0.04, hidden=(4,))
     monkeypatch.setattr(training._Run, "measure", lambda run, count: None)
 
     def start(resume=False):
-        learner = shac.Shac(task, params, config)
-        training.train(learner, task, {"learner": "shac", "task": "stabilize"}, tmp_path, resume)
+        learner = apg.Apg(task, params, config)
+        training.train(learner, task, {"learner": "apg", "task": "stabilize"}, tmp_path, resume)
         return learner
 
     return start
@@ -196,13 +209,26 @@ def parsed(command):
     return calls[0]
 
 
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.json")), ids=lambda path: path.stem)
+RECORDED = {path.stem: json.loads(path.read_text())["training"]["command"] for path in sorted(SHIPPED.glob("*.json"))}
+BY_AN_EARLIER_VERSION = {name for name, command in RECORDED.items() if "ballbot train shac" in command}
+
+
+def test_the_page_names_the_policies_that_only_an_earlier_version_could_train():
+    page = (SHIPPED.parents[2] / "docs" / "policies.md").read_text()
+    sentence = re.search(r"By an earlier version[^.]*\.", page)[0]
+    assert set(re.findall(r"`([\w-]+)`", sentence)) == BY_AN_EARLIER_VERSION | {"shac"}
+    with pytest.raises(ValueError, match="`shac` is now `apg`"):
+        parsed(RECORDED["stabilize-shac"].split(" && ")[1])
+
+
+@pytest.mark.parametrize("path", [SHIPPED / f"{name}.json" for name in RECORDED if name not in BY_AN_EARLIER_VERSION])
 def test_recorded_commands_give_the_recorded_settings(path):
     record = json.loads(path.read_text())["training"]
     *earlier, last = record["command"].split(" && ")
     learner, options, settings = parsed(last)
     assert json.loads(json.dumps(asdict(settings))) == record["settings"]
-    assert (learner, options.task, options.seed) == (record["learner"], record["task"], record["seed"])
+    recorded = {"shac": "apg"}.get(record["learner"], record["learner"])  # its name when these policies were trained
+    assert (learner, options.task, options.seed) == (recorded, record["task"], record["seed"])
     assert [value and str(value) for value in (options.demos, options.start)] == [record["demos"], record["start"]]
     for command in earlier:
         words = shlex.split(command)
@@ -237,7 +263,7 @@ def test_help_lists_every_setting_with_the_defaults_of_the_task_and_on_demand_wh
     settings = LEARNERS[learner].settings("weave")
     for field in fields(settings):
         assert f"--{field.name.replace('_', '-')}" in printed["--help"]
-    assert "256 256" in printed["--help"] or learner != "shac"
+    assert "256 256" in printed["--help"] or learner != "apg"
     assert len(printed["--help"].splitlines()) <= 60
     assert "Evaluations, at equal distances." in printed["-H"]
 
@@ -252,7 +278,7 @@ SMALL = {
     "dagger": {"episodes_per_iteration": 1, "label_seconds": 0.1, "gradient_steps": 2},
     "ppo": {"num_envs": 4, "num_steps": 8, "batch_size": 32},
     "sac": {"num_envs": 2, "num_steps": 2, "batch_size": 4},
-    "shac": {"num_envs": 4, "horizon": 3, "iterations": 3},
+    "apg": {"num_envs": 4, "episode_seconds": 0.06, "iterations": 3},
 }
 
 
@@ -276,3 +302,25 @@ def test_a_training_in_another_thread_comes_to_its_end(short_run, tmp_path, monk
     with ThreadPoolExecutor(1) as pool:
         pool.submit(short_run).result()
     assert (tmp_path / "policy.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "again"), [(signal.SIGINT, "press Ctrl-C again"), (signal.SIGTERM, "send the signal again")]
+)
+def test_a_training_that_is_stopped_says_how_to_stop_it_at_once(number, again, capsys):
+    with training._interruptible() as interrupted:
+        signal.raise_signal(number)
+        assert interrupted()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert f"saving; {again} to stop at once" in capsys.readouterr().out
+
+
+def test_the_handler_of_a_program_that_embeds_python_stays(monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    with training._interruptible() as interrupted:
+        monkeypatch.undo()
+        assert signal.getsignal(signal.SIGTERM) is before
+        assert not interrupted()
+    assert signal.getsignal(signal.SIGTERM) is before

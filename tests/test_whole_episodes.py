@@ -1,4 +1,4 @@
-"""SHAC through whole episodes: its gradient is that of whole episodes, on every task."""
+"""Analytic policy gradient through whole episodes: its gradient is that of whole episodes, on every task."""
 
 from dataclasses import replace
 
@@ -10,15 +10,16 @@ from resuming import goes_on_as_if_never_stopped
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks import TASKS
-from ballbot_train.learning.learners import LEARNERS, shac
-from ballbot_train.policy import load_network
-from ballbot_train.policy_files import shipped_policies
+from ballbot_train.learning import apg
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.files import shipped_policies
+from ballbot_train.policy.network import load_network
 
 
 def made(name, seed=0, robot="paper", start=None, **settings):
-    small = {"horizon": 0, "iterations": 4, "num_envs": 4, "episode_seconds": 0.2, "hidden": (8,), "symmetry": "none"}
-    settings = replace(LEARNERS["shac"].settings(name), **(small | settings))
-    return LEARNERS["shac"].make(make_task(name, robot), named_robot(robot), settings, seed, None, start)
+    small = {"iterations": 4, "num_envs": 4, "episode_seconds": 0.2, "hidden": (8,), "symmetry": "none"}
+    settings = replace(LEARNERS["apg"].settings(name), **(small | settings))
+    return LEARNERS["apg"].make(make_task(name, robot), named_robot(robot), settings, seed, None, start)
 
 
 def test_it_goes_on_from_its_state_as_if_never_stopped():
@@ -45,8 +46,8 @@ def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name, symmetry)
 
 
 def test_costs_are_those_of_the_policy_s_episodes(monkeypatch):
-    monkeypatch.setattr(shac, "_GOAL_PENALTY", 1e4)
-    monkeypatch.setattr(shac, "_GOAL_CLEARANCE", 0.0)
+    monkeypatch.setattr(apg, "_GOAL_PENALTY", 1e4)
+    monkeypatch.setattr(apg, "_GOAL_CLEARANCE", 0.0)
     start = load_network(shipped_policies(make_task("turn"))["ppo"], make_task("turn"))
     learner = made("turn", start=start, num_envs=16, episode_seconds=4.6)
     state = learner._batch.state

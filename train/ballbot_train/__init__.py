@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from ballbot_train.learning.callbacks import RegretCallback
     from ballbot_train.learning.rsl import RslVecEnv
     from ballbot_train.learning.sb3 import BallbotVecEnv
-    from ballbot_train.onnx_export import export_onnx
-    from ballbot_train.play.simulation import Playground
-    from ballbot_train.policy import load_policy
-    from ballbot_train.policy_files import shipped_policies
+    from ballbot_train.policy.export_onnx import export_onnx
+    from ballbot_train.policy.files import shipped_policies
+    from ballbot_train.policy.network import load_policy
     from ballbot_train.report.replay import certified_replay
+    from ballbot_train.report.simulation import Playground
 
 __all__ = [
     "BallbotVecEnv",
@@ -44,15 +44,15 @@ __all__ = [
 
 _MODULES = {
     "BallbotVecEnv": "learning.sb3",
-    "Playground": "play.simulation",
+    "Playground": "report.simulation",
     "RegretCallback": "learning.callbacks",
     "RslVecEnv": "learning.rsl",
     "certified_replay": "report.replay",
     "evaluate": "evaluation.evaluate",
     "evaluate_fresh": "evaluation.fresh",
-    "export_onnx": "onnx_export",
-    "load_policy": "policy",
-    "shipped_policies": "policy_files",
+    "export_onnx": "policy.export_onnx",
+    "load_policy": "policy.network",
+    "shipped_policies": "policy.files",
 }
 
 

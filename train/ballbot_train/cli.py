@@ -9,21 +9,25 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import sys
+import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 try:
     from rich.table import Table
 
-    from ballbot_train.console import PlainConsole, console
+    from ballbot_train.work.console import PlainConsole, console
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 
     sys.exit(str(missing("ballbot", error.name, "train")))
 
-from ballbot_train.commands import COMMANDS, GROUPS, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -63,16 +67,20 @@ def _run(arguments: list[str]) -> int:
 
         sys.stdout.write(f"ballbot {version('ballbot-gym')}\n")
         return 0
+    if command in MOVED:
+        errors.print(MOVED[command], style="red")
+        return 2
     if command not in COMMANDS:
         close = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
         errors.print(f"ballbot: no command {command!r}; {hint}", style="red")
         return 2
     try:
-        _call(command, options)
+        with _terminated_as_interrupted() as terminated:
+            _call(command, options)
     except KeyboardInterrupt:
         errors.print(f"interrupted; {_again(command, options)}")
-        return 130
+        return 128 + (signal.SIGTERM if terminated else signal.SIGINT)
     except ModuleNotFoundError as error:
         from ballbot_gym.lazy import install
 
@@ -89,6 +97,28 @@ def _run(arguments: list[str]) -> int:
         errors.print(f"ballbot: {error}", style="red")
         return 1
     return 0
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[list[int]]:
+    """SIGTERM, as schedulers and `timeout` send it, interrupts as Ctrl-C does, so that nothing half-written is left behind.
+
+    Yields a list that is not empty after a SIGTERM.
+    """
+    received: list[int] = []
+
+    def on_signal(number: int, frame: object) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if ours:
+        signal.signal(signal.SIGTERM, on_signal)
+    try:
+        yield received
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _call(command: str, options: list[str]) -> Any:
@@ -177,7 +207,7 @@ def _again(command: str, options: list[str]) -> str:
 def _expected() -> tuple[type[RuntimeError], ...]:
     """The other errors that a user can cause. An `except` asks for them when there is an error."""
     from ballbot_gym.rollout import PlanError
-    from ballbot_train.executors import WorkerError
+    from ballbot_train.work.executors import WorkerError
 
     return PlanError, WorkerError
 

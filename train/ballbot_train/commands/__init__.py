@@ -10,7 +10,7 @@ from pathlib import Path
 GROUPS = {
     "measure": ("benchmark", "evaluate", "compare", "robustness", "transfer", "basins", "submit", "verify"),
     "look": ("play", "page", "replay", "optimize", "paper"),
-    "train": ("train", "tune", "demos"),
+    "train": ("train", "demos"),
     "make": ("new", "certify", "export"),
 }
 """The commands by what they are for, in the order of `ballbot --help`."""
@@ -18,7 +18,10 @@ GROUPS = {
 COMMANDS = {name: f"{__name__}.{name}:{name}" for names in GROUPS.values() for name in names}
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 
-RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train", "tune")
+MOVED = {"tune": "`ballbot tune` is an example now: python examples/tune.py --task TASK (in the source repository)"}
+"""What to do in place of commands of earlier versions."""
+
+RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train")
 """Those that continue where they were interrupted; `train` does it with --resume."""
 
 

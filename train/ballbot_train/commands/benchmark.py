@@ -8,16 +8,8 @@ from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, console, physics_or_default
 from ballbot_train.evaluation import robustness
-from ballbot_train.evaluation.benchmark import (
-    Group,
-    controllers_of,
-    open_run,
-    publish,
-    run_groups,
-)
-from ballbot_train.evaluation.evaluate import checked_episodes
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import (
     HEADER,
     TABLE,
@@ -26,10 +18,12 @@ from ballbot_train.evaluation.results import (
     write_leaderboard,
     write_results,
 )
-from ballbot_train.executors import Workers
+from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
 from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Take, certified_replay, telling_episode
+from ballbot_train.work.console import Physics, RobotName, console, physics_or_default
+from ballbot_train.work.executors import Workers
 
 
 def benchmark(
@@ -74,13 +68,13 @@ def benchmark(
         rows = robustness.track_rows(results, robot, seed)
         write_results("tracks", rows, results, facts, out)
         title = f"{episodes} certified episodes per task and track, physics={physics}"
-        publish(out, "tracks", title, robustness.TRACK_TABLE, rows)
+        publish(out, "tracks", title, robustness.TRACK_TABLE, rows, facts)
         return
     groups = [Group(task, name, physics, robot) for task, names in chosen.items() for name in names]
     done = run_groups(groups, episodes, out, workers, seed, record=True)
-    rows = leaderboard(done, seed)
+    rows, ways = leaderboard(done, seed), facts.get("trained_by", {})
     write_leaderboard(rows, done, facts, out)
-    regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
+    regrets = figures.save(figures.regret_figure(done, ways), out / "figures" / "regret.png")
     replays, pictures = [], []
     for task, names in chosen.items():
         episode = telling_episode(task, done)
@@ -92,9 +86,9 @@ def benchmark(
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    report = report_page(title, replays, HEADER, table_cells(TABLE, rows), shown, facts)
+    report = report_page(title, replays, HEADER, table_cells(TABLE, rows, ways), shown, facts)
     page = files.write(out / "report.html", report)
-    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows)
+    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows, facts)
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")

@@ -5,20 +5,20 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines import certification
+from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import named_problem_digest
+from ballbot_gym.identity import named_problem
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import RobotName, check_least, check_some, console
 from ballbot_train.evaluation import optima
-from ballbot_train.executors import Workers
-from ballbot_train.provenance import provenance
+from ballbot_train.work import jobs
+from ballbot_train.work.console import RobotName, check_least, check_some, console
+from ballbot_train.work.executors import Workers
+from ballbot_train.work.provenance import provenance
 
 _MOST_EPISODES = 100_000
 
@@ -40,7 +40,7 @@ def certify(
         tasks: names of tasks.
         episodes: how many, from the first.
         shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
-            memory. See `ballbot_train.shards`.
+            memory. See `ballbot_train.work.shards`.
         out: folder of the .npz files.
         workers: who does the work.
         robot: whose sets.
@@ -75,13 +75,13 @@ def certify(
 
 
 def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str) -> None:
-    from ballbot_train.shards import make
+    from ballbot_train.work.shards import make
 
     for name in tasks:
         about = {
             "certified": make_task(name, robot).problem(),
             "version": provenance()["version"],
-            "problem": named_problem_digest(name, robot),
+            "problem": named_problem(name, robot),
             **robot_setting(robot),
         }
         set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, robot)

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from ballbot_train.console import console, print_table
 from ballbot_train.evaluation import comparison
 from ballbot_train.evaluation.results import with_interval
 from ballbot_train.evaluation.submissions import read_run
+from ballbot_train.work.console import console, print_table
 
 
 def compare(

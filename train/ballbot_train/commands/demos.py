@@ -8,9 +8,9 @@ import numpy as np
 
 from ballbot_gym.robots import file_name
 from ballbot_train.commands.options import UNNAMED, WorkersOption
-from ballbot_train.console import console
-from ballbot_train.executors import Workers
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
+from ballbot_train.work.console import console
+from ballbot_train.work.executors import Workers
 
 
 def demos(
@@ -24,7 +24,7 @@ def demos(
     Args:
         config: what is recorded.
         shards: URL or folder for a set of shards in place of a Minari dataset, for more episodes than fit into memory; see
-            `ballbot_train.shards`.
+            `ballbot_train.work.shards`.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
         workers: who does the work.
     """

@@ -1,4 +1,4 @@
-"""`ballbot evaluate POLICY`: one policy on thousands of fresh episodes."""
+"""`ballbot evaluate POLICY`: one controller on the certified episodes, or on thousands of fresh ones."""
 
 import shlex
 from collections.abc import Sequence
@@ -7,18 +7,29 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.randomization import Randomization, checked_randomization
+from ballbot_gym.randomization import Randomization, checked_randomization, track_of
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import RobotName, check_least, console, print_rows, print_table, progress_bars
-from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
-from ballbot_train.evaluation.controllers import make_controller, task_name
-from ballbot_train.executors import Workers
-from ballbot_train.names import file_part
-from ballbot_train.provenance import provenance
+from ballbot_train.evaluation.controllers import controllers_of, make_controller, policy_digests, task_name
+from ballbot_train.evaluation.names import file_part
+from ballbot_train.evaluation.results import TABLE, leaderboard, write_leaderboard
+from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
+from ballbot_train.work import jobs
+from ballbot_train.work.console import (
+    Physics,
+    RobotName,
+    check_least,
+    console,
+    physics_or_default,
+    print_rows,
+    print_table,
+    progress_bars,
+)
+from ballbot_train.work.executors import Workers
+from ballbot_train.work.provenance import provenance
 
 _OPTIMA = 100  # fresh episodes whose regret is shown unless another number is given
 _WORST = 10
@@ -30,7 +41,9 @@ def evaluate(
     policy: str,
     /,
     task: str | None = None,
-    fresh: int = 10_000,
+    episodes: int = certified.EPISODES,
+    fresh: int | None = None,
+    physics: Physics | None = None,
     seed: int = 0,
     optima: int | None = None,
     out: Path | None = None,
@@ -38,49 +51,85 @@ def evaluate(
     robot: RobotName = PAPER,
     randomization: str | None = None,
 ) -> None:
-    """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
+    """Runs a controller on the certified episodes; or with --fresh on thousands of fresh ones, with all that failed.
 
     Args:
-        policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a policy that comes
+        policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a controller that comes
             with the package.
         task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
-        fresh: how many fresh episodes, in the batched closed-form model. They are never the certified ones.
-        seed: of the fresh episodes.
+        episodes: how many of the certified episodes.
+        fresh: instead of certified episodes, how many fresh ones, in the batched closed-form model.
+        physics: of certified episodes: "bullet", "mujoco" or "rk4"; default, the first that is installed.
+        seed: of the fresh episodes, or of the bootstrap intervals and of whatever a certified episode draws.
         optima: of how many fresh episodes, from the first, the optimum is found too, for their regret; default the first
             100, and none where --randomization varies what optima depend on. Optima stay in the user's cache folder, for
             later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
-        workers: who finds optima.
+        workers: who runs certified episodes, and finds optima.
         robot: whose episodes.
-        randomization: name of the track on which the episodes are, of robots and delays that the policy is not told.
+        randomization: name of the track on which the episodes are, of robots and delays that are hidden from the policy.
     """
     varied = checked_randomization(randomization)
     task = task_name(policy, task, robot)
-    controllers_of([task], [policy], robot)
-    if optima is None:
-        optima = 0 if varied.moves_optima else min(_OPTIMA, fresh)
-    check_least(0, optima=optima)
-    if optima > fresh:
-        raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
-    named = f"{task}-{file_part(policy)}" + (f"-on-{randomization}" if randomization else "")
+    chosen = controllers_of([task], [policy], robot)
+    check_least(0, optima=optima or 0)
+    named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
+    if fresh is not None:
+        if physics not in (None, "rk4"):
+            raise ValueError("fresh episodes run in the batched closed-form model; leave out --physics")
+        if optima is None:
+            optima = 0 if varied.moves_optima else min(_OPTIMA, fresh)
+        _evaluate_fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
+        return
+    if optima:
+        raise ValueError("the optima of certified episodes are known; give --optima with --fresh")
+    engine, count = physics_or_default(physics), checked_episodes(episodes)
+    settings = {"physics": engine, "episodes": count, "seed": seed}
+    settings |= {"tracks": [randomization]} if randomization else {}
+    facts = open_run(out, workers, {robot: chosen}, robot, **settings)
+    group = Group(task, policy, engine, robot, randomization=varied, own_optima=True)
+    results = run_groups([group], count, out, workers, seed, record=not varied.active)
+    rows = leaderboard(results, seed)
+    write_leaderboard(rows, results, facts, out)
+    publish(out, "leaderboard", f"{count} certified episodes of {task}, physics={engine}", TABLE, rows, facts)
+    console.print(f"all episodes: {out / 'episodes.csv'}")
+
+
+def _evaluate_fresh(
+    policy: str,
+    task: str,
+    count: int,
+    seed: int,
+    optima: int,
+    out: Path,
+    workers: Workers,
+    robot: str,
+    varied: Randomization,
+) -> None:
+    """A policy on fresh episodes: failures, success and cost by what makes episodes hard, and the worst ten."""
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
-    episodes.check_fresh(fresh, seed)
+    episodes.check_fresh(count, seed)
+    if optima > count:
+        raise ValueError(f"optima must be at most the {count} fresh episodes, not {optima}")
     episodes.history_of(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
     jobs.make_folder(out)
+    of = {"task": task, "policy": policy, "robot": robot, "randomization": track_of(varied)}
+    if (out / "fresh.json").exists():  # of the same policy they are replaced
+        about = files.read_json(out / "fresh.json").get("about")
+        held = {name: about.get(name, of[name]) for name in of} if isinstance(about, dict) else {}
+        jobs.check_same(held, of, out, "results")
     facts = provenance() | {
-        "task": task,
-        "policy": policy,
-        "robot": robot,
+        **of,
         "policies": policy_digests({task: [policy]}, robot),
         "seed": seed,
-        "episodes": fresh,
+        "episodes": count,
         "physics": "closed form, batched, float64",
     }
-    with progress_bars({"episodes": fresh}) as advance:
+    with progress_bars({"episodes": count}) as advance:
         progress = partial(advance, "episodes")
-        result = episodes.evaluate_fresh(policy, task, fresh, seed, None, progress, robot, varied)
+        result = episodes.evaluate_fresh(policy, task, count, seed, None, progress, robot, varied)
     if optima:
         result = replace(result, optima=episodes.find_optima(task, optima, seed, workers, robot, varied))
     worst = _worst(result, policy, task, out / "worst", robot, varied)

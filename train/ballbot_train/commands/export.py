@@ -5,9 +5,9 @@ from typing import Literal
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER, file_name, named_robot
-from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import FILTERED, policy_path, task_name
-from ballbot_train.names import file_part
+from ballbot_train.evaluation.names import file_part
+from ballbot_train.work.console import RobotName, console
 
 
 def export(
@@ -41,11 +41,11 @@ def export(
     source = policy if (policy, format) == ("lqr", "c") else policy_path(policy, problem, robot)
     path = Path("runs") / "export" / f"{file_name(task, robot)}-{name}.{format}" if out is None else out
     if format == "c":
-        from ballbot_train.report.c_export import export_c  # it imports torch
+        from ballbot_train.policy.export_c import export_c  # it imports torch
 
         written, how = export_c(source, path, problem, robot, filtered, prefix), f"-D{prefix.upper()}_TEST checks it"
     else:
-        from ballbot_train.onnx_export import export_onnx  # it imports torch
+        from ballbot_train.policy.export_onnx import export_onnx  # it imports torch
 
         written, how = export_onnx(source, path, problem, robot), "input observation, output action"
     console.print(f"{written}: {written.stat().st_size / 1e3:.0f} kB; {how}")

@@ -14,11 +14,11 @@ import gymnasium
 from ballbot_gym import files
 from ballbot_gym.robots import check_name
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_least, console, markdown, physics_or_default
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.results import HEADER, cells
+from ballbot_train.work.console import check_least, console, markdown, physics_or_default
 
-_TEMPLATES = Path(__file__).parent.parent / "template"
+_TEMPLATES = Path(__file__).parent / "template"
 _FIRST = ("lqr", "trajopt")
 _OURS = ("ballbot_gym", "ballbot_baselines", "ballbot_train")
 

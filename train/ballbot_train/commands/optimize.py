@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import RobotName, check_least, check_names, console, print_table
 from ballbot_train.report import figures, labels
+from ballbot_train.work.console import RobotName, check_least, check_names, console, print_table
 
 _MOST_STEPS = 5000  # control steps of an episode; longer ones take hours and gigabytes
 

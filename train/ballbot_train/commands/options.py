@@ -3,7 +3,7 @@
 from typing import Annotated
 
 from ballbot_gym.lazy import imports_of
-from ballbot_train.executors import Workers
+from ballbot_train.work.executors import Workers
 
 with imports_of(__name__):
     import tyro

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ballbot_train.console import console
+from ballbot_train.work.console import console
 
 
 def page(policies: tuple[str, ...] = (), /, out: Path = Path("runs/page/playground.html")) -> None:

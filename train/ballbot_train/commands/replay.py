@@ -3,12 +3,13 @@
 import math
 from pathlib import Path
 
+from ballbot_gym.engines import default_physics
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
-from ballbot_train.names import file_part
+from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
 from ballbot_train.report.replay import certified_replay, file_replay
+from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 
 _MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "webp": 640}  # px
@@ -58,15 +59,16 @@ def replay(
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
         paths = [Path(entry) for entry in source]
-        shown, name = file_replay(paths), "-".join(file_part(str(path)) for path in paths)
+        shown, name = file_replay(paths), "+".join(file_part(str(path)) for path in paths)
     else:
         _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
         check_names("task", source, TASKS)
         _check(bool(controllers), "give at least one controller")
         shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)
         made = file_name(source[0], robot)
-        name = f"{made}-{'-'.join(file_part(controller) for controller in controllers)}-{episode}"
-        name += "-on-" * bool(frictions) + "-".join(f"{friction:g}" for friction in frictions)
+        # parts of names hold no plus, so that no other controllers or floors make the same name
+        name = f"{made}-{'+'.join(file_part(controller) for controller in controllers)}-{episode}"
+        name += "".join(f"+{friction}" for friction in frictions) + f"-{physics}" * (physics != default_physics())
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":

@@ -6,18 +6,13 @@ from pathlib import Path
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
 from ballbot_train.evaluation import robustness as stressed
-from ballbot_train.evaluation.benchmark import (
-    controllers_of,
-    open_run,
-    publish,
-    run_groups,
-)
-from ballbot_train.evaluation.evaluate import checked_episodes
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
-from ballbot_train.executors import Workers
+from ballbot_train.evaluation.runner import checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
+from ballbot_train.work.console import Physics, RobotName, check_some, console, physics_or_default
+from ballbot_train.work.executors import Workers
 
 
 def robustness(
@@ -56,16 +51,18 @@ def robustness(
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
     write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
-        figures.save(figures.robustness_figure(rows, task), out / "figures" / f"robustness-{task}.png")
+        figures.save(
+            figures.robustness_figure(rows, task, facts.get("trained_by", {})),
+            out / "figures" / f"robustness-{task}.png",
+        )
     curves = [
         stressed.curve_of(rows, task, controller, name)
         for task, group in chosen.items()
         for name in stresses
         for controller in group
     ]
-    publish(
-        out, "robustness", f"{episodes} certified episodes per task and severity, physics={physics}", _TABLE, curves
-    )
+    title = f"{episodes} certified episodes per task and severity, physics={physics}"
+    publish(out, "robustness", title, _TABLE, curves, facts)
     console.print(f"curves: {out / 'figures'}")
 
 

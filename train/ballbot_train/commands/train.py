@@ -13,13 +13,16 @@ from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import UNNAMED
-from ballbot_train.console import RobotName, check_names, console, option, physics_or_default
-from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
-from ballbot_train.learning.learners import LEARNERS, check_settings
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.settings import check_ranges, number
+from ballbot_train.work.console import RobotName, check_names, console, option, physics_or_default
+from ballbot_train.work.executors import Workers
 
-_MOST_THREADS = 1024
-_MOST_VALIDATION_EPISODES = 100_000
+_RENAMED = {
+    "shac": "`shac` is now `apg`: write `ballbot train apg`, without --horizon 0; windows with a critic are gone",
+}
+"""What to write for a learner of an earlier version."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Run:
     """Name of a task."""
     out: Path | None = None
     """Folder; default runs/train/TASK-LEARNER."""
-    seed: int = 0
+    seed: int = number(0, 0, 2**32 - 1)
     """Seed of all that is drawn."""
     resume: bool = False
     """Continue the run in this folder."""
@@ -42,27 +45,16 @@ class Run:
     """Policy file to train on from."""
     randomization: str | None = None
     """Track: unknown, late, noisy or real; not sac."""
-    history: int = 0
+    history: int = number(0, 0)
     """Earlier observations and actions that are seen."""
     informed: bool = False
     """The policy is told each robot, and runs behind a filter."""
-    threads: int = 1
+    threads: int = number(1, 1, 1024)
     """Threads of torch."""
-    test_episodes: int = certified.EPISODES
+    test_episodes: int = number(certified.EPISODES, 1, certified.EPISODES)
     """Certified episodes that measure the kept policy."""
-    validation_episodes: int = VALIDATION_EPISODES
+    validation_episodes: int = number(VALIDATION_EPISODES, 1, 100_000)
     """Fresh episodes that choose the policy to keep."""
-
-    def check(self) -> None:
-        """Raises a ValueError that names the first number out of its range."""
-        for name, least, most in (
-            ("threads", 1, _MOST_THREADS),
-            ("seed", 0, 2**32 - 1),
-            ("test_episodes", 1, certified.EPISODES),
-            ("validation_episodes", 1, _MOST_VALIDATION_EPISODES),
-        ):
-            if not least <= getattr(self, name) <= most:
-                raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
 
     @property
     def warm(self) -> bool:
@@ -79,14 +71,13 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
         settings: the learner's settings; default, those tuned for the task.
         command: the command that was typed, for the record; default, one with all settings.
     """
-    check_names("learner", [learner], LEARNERS)
+    check_learner(learner)
     check_names("task", [run.task], TASKS)
-    LEARNERS[learner].check(run.demos, run.start)
-    run.check()
+    check_ranges(run)
     if run.out is None:
         run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")
     settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
-    check_settings(settings)
+    settings.check()
     _train(learner, run, settings, command or command_with(learner, run, settings))
 
 
@@ -98,17 +89,18 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     from ballbot_gym.env import make_task
     from ballbot_train.evaluation import optima
     from ballbot_train.learning import training
-    from ballbot_train.policy import load_network
+    from ballbot_train.policy.network import load_network
 
     torch.set_num_threads(run.threads)
-    problem, out, varied = make_task(run.task, run.robot), cast(Path, run.out), checked_randomization(run.randomization)
+    problem, params, out = make_task(run.task, run.robot), named_robot(run.robot), cast(Path, run.out)
+    varied = checked_randomization(run.randomization)
+    given = None if run.randomization is None else varied, run.history, run.informed
+    LEARNERS[learner].check(problem, params, run.demos, run.start, *given)
     config = _config(learner, run, settings, command)
     # by which it is scored while it learns
     optima.known(problem, run.robot, workers=Workers(), randomization=varied)
     start = None if run.start is None else load_network(run.start, problem, robot=None)
-    world = None if run.randomization is None else varied
-    given = settings, run.seed, run.demos, start, world, run.history, run.informed
-    made = LEARNERS[learner].make(problem, named_robot(run.robot), *given)
+    made = LEARNERS[learner].make(problem, params, settings, run.seed, run.demos, start, *given)
     physics = physics_or_default(None)
     row = training.train(made, problem, config, out, run.resume, run.test_episodes)
     console.print(
@@ -120,7 +112,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
 def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, Any]:
     """The record of a run; it also says how the demonstrations, or the policy to start from, were made."""
     from ballbot_train.learning.datasets import command_of
-    from ballbot_train.policy_files import read_description
+    from ballbot_train.policy.files import read_description
 
     inputs = [] if run.demos is None else [command_of(run.demos)]
     if run.start is not None:
@@ -143,6 +135,13 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
         **robot_setting(run.robot),
         **{name: value for name in optional if (value := getattr(run, name)) != getattr(Run, name)},
     }
+
+
+def check_learner(name: str) -> None:
+    """Raises a ValueError where there is no learner of that name."""
+    if name in _RENAMED:
+        raise ValueError(_RENAMED[name])
+    check_names("learner", [name], LEARNERS)
 
 
 def _share(value: float) -> str:
@@ -189,7 +188,7 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
             args=list(arguments),
         )
         return
-    check_names("learner", [named], LEARNERS)
+    check_learner(named)
     check_names("task", [known.task], TASKS)
     settings = LEARNERS[named].settings(known.task, {known.demos, known.start} - {None, "None"} != set())
 

@@ -10,18 +10,11 @@ from pathlib import Path
 from ballbot_gym.robots import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
-from ballbot_train.evaluation.benchmark import (
-    Group,
-    controllers_by_robot,
-    floor,
-    open_run,
-    publish,
-    run_groups,
-)
-from ballbot_train.evaluation.evaluate import checked_episodes
+from ballbot_train.evaluation.controllers import controllers_by_robot
 from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
-from ballbot_train.executors import Workers
+from ballbot_train.evaluation.runner import Group, checked_episodes, floor, open_run, publish, run_groups
+from ballbot_train.work.console import Physics, RobotName, check_some, console, physics_or_default
+from ballbot_train.work.executors import Workers
 
 _REGRET = "regret over the optimum on the robot's own floor"
 _IN_CSV = {
@@ -96,5 +89,5 @@ def transfer(
     results = run_groups(groups, episodes, out, workers, seed)
     rows = leaderboard(results, seed)
     write_results("transfer", rows, results, facts, out, _IN_CSV, regret=_REGRET)
-    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows)
+    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows, facts)
     console.print(f"matrix: {out / 'transfer.csv'}")

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from ballbot_train.console import console, print_rows
 from ballbot_train.evaluation import submissions
 from ballbot_train.evaluation.results import with_interval
+from ballbot_train.work.console import console, print_rows
 
 
 def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:

@@ -2,12 +2,11 @@
 
 A map spans the lean γ and one other component of Stabilize's initial state; the rest is zero. A state is recovered if the
 episode succeeds: at rest at the origin when it ends. It is recoverable if it lies within the boundary that
-`ballbot_baselines.recovery` finds, or if any controller recovers from it. Turning the world by 180° takes (γ, v) to
+`ballbot_baselines.optimum.recovery` finds, or if any controller recovers from it. Turning the world by 180° takes (γ, v) to
 (−γ, −v), so only half of every map is run.
 """
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +15,12 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import files
-from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER, named_robot
-from ballbot_gym.rollout import Controller, PlanError, rollout
-from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import portable
-from ballbot_train.evaluation.evaluate import as_controller
-from ballbot_train.executors import Workers
+from ballbot_train.evaluation import runner
+from ballbot_train.evaluation.results import Result
+from ballbot_train.work import jobs
+from ballbot_train.work.executors import Workers
 
 TASK = "stabilize"
 LEAN_LIMIT = 75.0  # degrees, either side
@@ -74,12 +72,13 @@ def run(
     search = [jobs.Job(f"boundary-{name}", _boundary, (robot,), (name,), "boundary") for name in AXES]
     found = jobs.run(search, out, workers)
     bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
-    done = jobs.run(cell_jobs(bounds, controllers, points, physics, robot), out, workers)
-    return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
+    cells = cells_of(bounds, points)
+    results = runner.run_groups(groups_of(cells, controllers, points, physics, robot), 0, out, workers)
+    return maps_of(bounds, cells, results, controllers, points)
 
 
 def _boundary(robot: str, names: Sequence[str]) -> Iterator[jobs.Entry]:
-    from ballbot_baselines.recovery import largest_leans  # it imports CasADi
+    from ballbot_baselines.optimum.recovery import largest_leans  # it imports CasADi
 
     for name in names:
         values = grid(name, _BOUNDARY_POINTS)[1]
@@ -104,55 +103,42 @@ def grid(axis: str, points: int) -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(-LEAN_LIMIT, LEAN_LIMIT, points), np.linspace(-limit, limit, points)
 
 
-def cell_jobs(
-    bounds: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str, robot: str = PAPER
-) -> list[jobs.Job]:
-    """Every state to run, row by row of every map: those within the boundaries or little beyond, of half a map."""
-    work = []
-    for name, boundary in bounds.items():
-        worth = _within(boundary, *grid(name, points), _DOUBT)
-        for controller in controllers:
-            sent = portable(controller, make_task(TASK, robot), named_robot(robot))
-            arguments = name, controller, physics, points, sent, robot
-            for i in range(points // 2, points):
-                items = tuple((i, int(j)) for j in np.flatnonzero(worth[i]))
-                stem = f"{name}-{controller}-{physics}-{points}-{i:02d}"
-                work.append(jobs.Job(stem, _cells, arguments, items, controller))
-    return work
+def cells_of(bounds: Mapping[str, np.ndarray], points: int) -> dict[str, np.ndarray]:
+    """The states to run, as (n, 2) rows and columns of each map: those within the boundaries or little beyond, of half a
+    map.
+    """
+    worth = {name: _within(boundary, *grid(name, points), _DOUBT) for name, boundary in bounds.items()}
+    return {name: np.argwhere(inside & (np.arange(points) >= points // 2)[:, None]) for name, inside in worth.items()}
 
 
-def _cells(
-    axis: str,
-    controller: str,
-    physics: str,
-    points: int,
-    sent: str | Controller,
-    robot: str,
-    items: Sequence[tuple[int, int]],
-) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(TASK, physics=physics, robot=robot, arena_radius=_ARENA_RADIUS)
-    made = as_controller(sent, env.task, env.params)
-    leans, values = grid(axis, points)
-    for i, j in items:
-        x = np.zeros(env.params.state_size)
-        x[2], x[AXES[axis].component] = math.radians(leans[j]), values[i]
-        try:
-            recovered = rollout(env, made, seed=0, options={"state": x}).success
-        except PlanError:
-            recovered = False
-        yield {"axis": axis, "controller": controller, "i": i, "j": j, "recovered": recovered}
-    env.close()
+def groups_of(
+    cells: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str, robot: str = PAPER
+) -> list[runner.Group]:
+    """What to run, for `run_groups`: every controller from all states of each map. Results are told by their "axis"."""
+    groups = []
+    for name, chosen in cells.items():
+        leans, values = grid(name, points)
+        starts = np.zeros((len(chosen), named_robot(robot).state_size))
+        starts[:, AXES[name].component], starts[:, 2] = values[chosen[:, 0]], np.radians(leans[chosen[:, 1]])
+        world: dict[str, Any] = {"starts": starts, "fields": {"arena_radius": _ARENA_RADIUS}, "told": {"axis": name}}
+        groups += [runner.Group(TASK, each, physics, robot, counts_for=each, **world) for each in controllers]
+    return groups
 
 
 def maps_of(
-    bounds: Mapping[str, np.ndarray], entries: Iterable[jobs.Entry], controllers: Sequence[str], points: int
+    bounds: Mapping[str, np.ndarray],
+    cells: Mapping[str, np.ndarray],
+    results: Iterable[Result],
+    controllers: Sequence[str],
+    points: int,
 ) -> list[BasinMap]:
-    """The maps that finished states make up."""
+    """The maps that the results of all states make up."""
     recovered = {name: {c: np.zeros((points, points), bool) for c in controllers} for name in bounds}
-    for entry in entries:
-        cells, i, j = recovered[entry["axis"]][entry["controller"]], entry["i"], entry["j"]
-        cells[i, j] |= entry["recovered"]
-        cells[-1 - i, -1 - j] |= entry["recovered"]
+    for result in results:
+        axis = result.told["axis"]
+        found, (i, j) = recovered[axis][result.controller], cells[axis][result.episode]
+        found[i, j] |= result.success
+        found[-1 - i, -1 - j] |= result.success
     maps = []
     for name, boundary in bounds.items():
         leans, values = grid(name, points)

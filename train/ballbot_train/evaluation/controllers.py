@@ -1,15 +1,26 @@
-"""Controllers by name: experts of `CONTROLLERS`, policies that come with the package, policy files and saved models."""
+"""Controllers by name: experts of `CONTROLLERS`, policies that come with the package, policy files and saved models; and
+anything else that acts, as a controller.
+"""
 
+import inspect
+import itertools
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any, cast
+
+import numpy as np
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
-from ballbot_gym.rollout import Controller
+from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train.console import check_names
-from ballbot_train.policy_files import is_run, read_description, shipped_policies, weights_digest
+from ballbot_train.policy import files as policy_files
+from ballbot_train.policy.files import PolicyError, is_run, read_description, shipped_policies, weights_digest
+from ballbot_train.work.console import check_names, check_some
 
 FILTERED = "-ekf"
 """Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
@@ -86,7 +97,7 @@ def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
         PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
     """
     if is_saved_model(name):
-        from ballbot_train.saved_models import fits  # it imports torch
+        from ballbot_train.policy.saved_models import fits  # it imports torch
 
         return fits(plain(name), task, named_robot(robot))
     spec = read_description(plain(name))["spec"]
@@ -100,7 +111,7 @@ def made_for(name: str) -> str:
         PolicyError: the file is missing or damaged.
     """
     if is_saved_model(name):
-        from ballbot_train.saved_models import read
+        from ballbot_train.policy.saved_models import read
 
         return f"a task with {read(plain(name)).observations} observations"
     spec = read_description(plain(name))["spec"]
@@ -114,6 +125,12 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
         return ""
     robot, name = robot if isinstance(robot, str) else robot_name(robot), plain(name)
     return weights_digest(shipped_policies(task, robot, None).get(name, name))
+
+
+def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
+    """Digest of the network of a policy by name or file, as its description says; see `policy_files.network_digest`."""
+    name = plain(name)
+    return policy_files.network_digest(shipped_policies(task, robot, None).get(name, name))
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
@@ -186,7 +203,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ending = ending or "-adaptive"
     if not ending:
         return controller
-    from ballbot_baselines.adaptive import FilteredController  # it imports CasADi
+    from ballbot_baselines.feedback.adaptive import FilteredController  # it imports CasADi
 
     return FilteredController(task, params, ending, controller)
 
@@ -200,10 +217,165 @@ def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
         known = f"{task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
         raise ValueError(f"unknown controller {name!r}; {of_other_robot(name, task) or known}")
     if is_saved_model(name):
-        from ballbot_train.policy import PolicyController  # it imports torch
-        from ballbot_train.saved_models import load_actor
+        from ballbot_train.policy.network import PolicyController  # it imports torch
+        from ballbot_train.policy.saved_models import load_actor
 
         return PolicyController(task, params, load_actor(name, task, params))
-    from ballbot_train.policy import load_policy
+    from ballbot_train.policy.network import load_policy
 
     return load_policy(shipped.get(name, name), task, params)
+
+
+def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
+    """Anything that acts, as a Controller.
+
+    Args:
+        policy: a Controller; a Stable-Baselines3 model that was trained in the env's own spaces, whose VecNormalize is
+            applied where it was trained with one; another object with `predict(observation)`, which returns an action or a
+            tuple that begins with one; a torch module from observations (B, no) to actions (B, 2); a function from
+            observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
+        task: what it is to do.
+        params: the robot that it believes to control.
+
+    Raises:
+        TypeError: it is none of these.
+        ValueError, PolicyError: as `make_controller`; or the model was trained in other spaces than the env's.
+    """
+    if isinstance(policy, str | Path):
+        return make_controller(str(policy), task, params)
+    if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
+        return policy
+    if callable(getattr(policy, "predict", None)):
+        predictor = Predictor(policy, task, params)
+        return ActionController(task, params, predictor, predictor.history)
+    torch: Any = sys.modules.get("torch")
+    if torch is not None and isinstance(policy, torch.nn.Module):
+        return ActionController(task, params, _module_actions(policy))
+    if callable(policy):
+        function = cast(Callable[[np.ndarray], np.ndarray], policy)
+        return ActionController(task, params, lambda observation, begins: function(observation))
+    raise TypeError(
+        f"{policy!r} is no policy: give a Controller, a model with predict, a torch module or a function of the observation, "
+        "a name or a file"
+    )
+
+
+def _module_actions(module: Any) -> Callable[[np.ndarray, bool], np.ndarray]:
+    """The actions of a torch module, which takes (B, no) observations on the device and in the precision of its numbers."""
+    import torch
+
+    first = next(module.parameters(), torch.zeros(0))
+
+    def actions(observation: np.ndarray, begins: bool) -> np.ndarray:
+        seen = torch.as_tensor(np.atleast_2d(observation), dtype=first.dtype, device=first.device)
+        with torch.no_grad():
+            made = module(seen)
+        made = (made[0] if isinstance(made, tuple) else made).cpu().numpy()
+        return made if observation.ndim > 1 else made[0]
+
+    return actions
+
+
+class Predictor:
+    """The deterministic actions (..., 2) of an SB3 model, or of another object with `predict`.
+
+    Observations (..., no) are of an episode, or of one episode per env.
+
+    It keeps the recurrent state, and normalizes observations as in training.
+    """
+
+    def __init__(self, model: Any, task: Task, params: BallbotParams):
+        self._model, self._state, self.history = model, None, 0
+        self._takes = _keywords(model.predict)
+        if hasattr(model, "observation_space"):
+            from ballbot_train.policy.saved_models import check_spaces, history_of  # it imports torch
+
+            self.history = history_of(model, task, params)
+            check_spaces(type(model).__name__, model, task, params)
+        normalization = getattr(model, "get_vec_normalize_env", lambda: None)()
+        # only on-policy algorithms leave this empty where there was no VecNormalize
+        if normalization is None and hasattr(model, "gae_lambda") and model._last_original_obs is not None:
+            raise PolicyError(
+                f"{type(model).__name__} was trained with VecNormalize and has none now; load the model with it: "
+                f'{type(model).__name__}.load("model.zip", env=VecNormalize.load("vecnormalize.pkl", venv))'
+            )
+        self._seen = (lambda observation: observation) if normalization is None else normalization.normalize_obs
+
+    def __call__(self, observation: np.ndarray, begins: bool) -> np.ndarray:
+        offered = {
+            "state": None if begins else self._state,
+            "episode_start": np.full(len(np.atleast_2d(observation)), begins),
+            "deterministic": True,
+        }
+        taken = {name: value for name, value in offered.items() if self._takes is None or name in self._takes}
+        made = self._model.predict(self._seen(observation), **taken)
+        action, self._state = (made[0], made[1] if len(made) > 1 else None) if isinstance(made, tuple) else (made, None)
+        return action
+
+
+def _keywords(function: Any) -> set[str] | None:
+    """The keywords that a function takes; None where it takes any, or does not say."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    return None if any(each.kind is each.VAR_KEYWORD for each in parameters) else {each.name for each in parameters}
+
+
+def controllers_of(
+    tasks: Sequence[str], given: Sequence[str] = (), robot: str = PAPER, tracks: bool = False
+) -> dict[str, list[str]]:
+    """The controllers to run on each task: those named that the task has; without any, all it has but for variants.
+
+    Policies that were trained on tracks are among the latter if tracks are run.
+
+    A policy is made for one task, and is left out for the others; tasks left without a controller are left out too.
+
+    Raises:
+        ValueError: a name that none of the tasks has, a name that is given twice, or no task.
+        PolicyError: a policy file that is missing or damaged.
+    """
+    return controllers_by_robot(tasks, given, [robot], tracks)[robot]
+
+
+def controllers_by_robot(
+    tasks: Sequence[str], given: Sequence[str], robots: Sequence[str], tracks: bool = False
+) -> dict[str, dict[str, list[str]]]:
+    """As `controllers_of`, by the robots that controllers were made for. A name is of the robots that have it."""
+    check_some("task", tasks, TASKS)
+    track = None if tracks or given else ""
+    known = {robot: {task: names(make_task(task, robot), robot, track) for task in tasks} for robot in robots}
+    if not given:
+        return known
+    if repeated := [name for name, count in Counter(given).items() if count > 1]:
+        raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
+    chosen: dict[str, dict[str, list[str]]] = {}
+    for robot, task in itertools.product(robots, tasks):
+        if found := [name for name in given if acts_in(name, make_task(task, robot), robot)]:
+            chosen.setdefault(robot, {})[task] = found
+    used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
+    unused = [name for name in given if name not in used]
+    if unused and is_file(unused[0]):
+        raise ValueError(f"{unused[0]} was made for {made_for(unused[0])}, which is none of {', '.join(tasks)}")
+    for task in tasks if unused else ():
+        if hint := of_other_robot(unused[0], make_task(task, robots[0])):
+            raise ValueError(f"unknown controller {unused[0]} for the robot {robots[0]}; {hint}")
+    check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
+    return chosen
+
+
+def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
+    """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
+    return digests_of_policies(controllers, robot, policy_digest)
+
+
+def digests_of_policies(
+    controllers: Mapping[str, Sequence[str]], robot: str, digest: Callable[[str, Task, str], str]
+) -> dict[str, str]:
+    """A digest of every learned policy among controllers by task, under "TASK/NAME"."""
+    return {
+        f"{task}/{name}": digest(name, make_task(task, robot), robot)
+        for task, group in controllers.items()
+        for name in group
+        if not is_expert(name)
+    }

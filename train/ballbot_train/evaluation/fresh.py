@@ -30,13 +30,12 @@ from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names
-from ballbot_train.console import progress_bars
-from ballbot_train.evaluation.controllers import is_expert, make_controller
-from ballbot_train.evaluation.evaluate import Predictor
+from ballbot_train.evaluation.controllers import Predictor, is_expert, make_controller
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
-from ballbot_train.executors import Workers, completed
-from ballbot_train.policy import PolicyController, PolicyNetwork
+from ballbot_train.policy.network import PolicyController, PolicyNetwork
+from ballbot_train.work.console import progress_bars
+from ballbot_train.work.executors import Workers, completed
 
 with imports_of(__name__):
     import torch
@@ -399,7 +398,7 @@ def find_optima(
 
 
 def _optimal_cost(*problem: Any) -> float:
-    from ballbot_baselines.certification import optimum_of  # it imports CasADi
+    from ballbot_baselines.optimum.certification import optimum_of  # it imports CasADi
 
     try:
         return optimum_of(*problem).cost

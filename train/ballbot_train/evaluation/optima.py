@@ -19,9 +19,9 @@ from ballbot_gym.robots import PAPER, checked_robot, file_name, robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.checks import check_methods, check_paths
-from ballbot_train import jobs
-from ballbot_train.console import console, progress_bars
-from ballbot_train.executors import Workers, completed
+from ballbot_train.work import jobs
+from ballbot_train.work.console import console, progress_bars
+from ballbot_train.work.executors import Workers, completed
 
 with imports_of(__name__):
     import filelock
@@ -102,7 +102,7 @@ def compute(
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as advance:
-            from ballbot_baselines.certification import AT_ONCE, entries
+            from ballbot_baselines.optimum.certification import AT_ONCE, entries
 
             solve = partial(entries, task, robot=params, randomization=randomization)
             each = min(AT_ONCE, -(-len(missing) // _TASKS))

@@ -26,8 +26,8 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import file_name, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.names import file_part
-from ballbot_train.provenance import provenance
+from ballbot_train.evaluation.names import file_part
+from ballbot_train.work.provenance import provenance
 
 GRID = 1e-8
 """Of states, SI units. A step from a rounded state ends up to 12 times as far from the next one, in a violent fall."""

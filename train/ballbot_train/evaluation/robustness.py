@@ -24,9 +24,9 @@ from ballbot_gym.env import make_task
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.benchmark import Group
 from ballbot_train.evaluation.results import Result, Row, leaderboard, shown
-from ballbot_train.policy_files import track_in
+from ballbot_train.evaluation.runner import Group
+from ballbot_train.policy.files import track_in
 
 
 @dataclass(frozen=True)

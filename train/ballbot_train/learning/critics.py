@@ -10,7 +10,7 @@ from typing import cast
 import torch
 
 from ballbot_gym.tasks import Task
-from ballbot_train.weights import linear_layers
+from ballbot_train.policy.weights import linear_layers
 
 _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 

@@ -29,9 +29,9 @@ from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
 from ballbot_train.learning.state import load_state, state_of
+from ballbot_train.work.console import console
 
 FAILURE_PRICE = 60.0
 """What a failure costs at once where living does not pay."""
@@ -334,7 +334,7 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) ->
     Raises:
         ValueError: no optimum was found.
     """
-    from ballbot_baselines.optimum import Backoff, find_optimum  # it imports CasADi
+    from ballbot_baselines import Backoff, find_optimum  # it imports CasADi
 
     console.print(f"finding {count} optima on which training episodes begin")
     found, backoff = [], Backoff(goal=_RESERVE)

@@ -1,7 +1,7 @@
 """Teaches a policy's `Routes` which sides are cheapest: what every choice costs is predicted, for thousands of drawn slaloms.
 
-`ballbot_baselines.sides` predicts the costs from the motion without obstacles, which depends on the goal's distance alone. So
-no optimum of a slalom is searched for this.
+`ballbot_baselines.optimum.sides` predicts the costs from the motion without obstacles, which depends on the distance to the
+goal alone. So no optimum of a slalom is searched for this.
 """
 
 import math
@@ -10,14 +10,14 @@ from typing import cast
 import numpy as np
 import torch
 
-from ballbot_baselines import sides
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum import sides
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
-from ballbot_train.policy import Routes, farther_choices
+from ballbot_train.policy.network import Routes, farther_choices
+from ballbot_train.work.console import console
 
 EPISODES = 60_000
 _DISTANCES = 7  # for which the motion without obstacles is found

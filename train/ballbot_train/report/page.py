@@ -5,19 +5,18 @@ templates escape all text.
 """
 
 import base64
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from ballbot_gym import drawing, files
-from ballbot_gym.params import BallbotParams
+from ballbot_gym import files
+from ballbot_gym.drawing import page
 from ballbot_train.report.replay import Replay, Take
+from ballbot_train.work import templates
 
 _ASSETS = Path(__file__).parent / "assets"
 _REPLAY_DT = 0.02  # s, between the states in the page
@@ -42,51 +41,26 @@ def report_page(
         facts: what the results depend on, such as versions; shown at the foot of the page.
     """
     episodes = [_episode_data(replay) for replay in replays if replay.takes]
-    page = render(
+    text = render(
         "page.html.j2",
         title=title,
         header=header,
         rows=rows,
-        data=scene_data(replays[0].params) | {"episodes": episodes} if episodes else {},
+        data=page.look(replays[0].params) | {"episodes": episodes} if episodes else {},
         pictures={
             name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
             for name, group in pictures.items()
         },
         facts=facts,
         style=asset("style.css"),
-        scripts=[asset(name) for name in ("table.js", "scene.js", "replay.js")],
+        scripts=[asset("table.js"), Markup(page.asset("scene.js")), asset("replay.js")],
     )
-    return str(page)
-
-
-def scene_data(params: BallbotParams) -> dict[str, object]:
-    """How scene.js draws a robot."""
-    return {
-        "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
-        "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
-        "force_scale": drawing.FORCE_SCALE,
-        "least_force": drawing.LEAST_FORCE,
-    }
-
-
-@functools.cache
-def _templates() -> jinja2.Environment:
-    """The templates of `assets/`; those of pages escape every string that is not a `Markup`."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_ASSETS),
-        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False}
-    return environment
+    return str(text)
 
 
 def render(template: str, **values: object) -> Markup:
     """A template of `assets/` with these values."""
-    return Markup(_templates().get_template(template).render(values))
+    return templates.render(_ASSETS / template, **values)
 
 
 def asset(name: str) -> Markup:
@@ -116,6 +90,6 @@ def _take_data(take: Take) -> dict[str, object]:
         "label": take.label,
         "color": take.color,
         "note": take.note,
-        "x": x[:, :4].round(4).tolist(),
+        "x": np.hstack([x[:, :4], x[:, 8:9]]).round(4).tolist(),  # with the heading of a robot with wheels
         "u": u.round().astype(int).tolist(),
     }

@@ -1,0 +1,360 @@
+"""DAgger with the optimum as the expert: every state that the learner reaches is labelled with the optimal action there.
+
+The first iterations gather samples. Each of them draws episodes and finds their optima, thousands at once where that is
+possible. Half of the episodes then follow the expert, with noise, and half the learner. In a state that each of them came to
+the optimum is searched anew, and they run again from there (Ross et al., "A reduction of imitation learning and structured
+prediction to no-regret online learning", 2011, with the mixture β of expert and learner drawn per episode).
+
+The feedback about an optimum is the derivative of the optimal force with respect to the state. So it labels every state that
+an episode comes to, as long as that lies near its optimum. Errors are weighted by one over the cost of the episode's optimum,
+as regret is.
+
+On a track the expert knows each episode's robot, and the learner sees what it sees.
+"""
+
+import contextlib
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ballbot_baselines import Backoff, Optimum, find_optima, find_optimum
+from ballbot_baselines.feedback.trajopt import EXECUTED
+from ballbot_gym import dynamics
+from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym.batch_episodes import run_episodes
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.paths import sides_passed
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import registered_name
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import Task
+from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import RoutedSymmetry, actor_for
+from ballbot_train.learning.datasets import load_demos
+from ballbot_train.learning.fitting import Fit, Samples
+from ballbot_train.learning.routing import fit_routes
+from ballbot_train.learning.settings import MOST, Settings, number
+from ballbot_train.policy.network import PolicyNetwork
+
+
+@dataclass(frozen=True)
+class DaggerConfig(Settings):
+    """Settings of `Dagger`."""
+
+    iterations: int = number(60, 1, MOST)
+    """Number of iterations."""
+    gathering_iterations: int = number(40, 0, MOST)
+    """First of them that gather samples; 0: clone --demos."""
+    evaluations: int = number(10, 1, MOST)
+    """Evaluations, at equal distances."""
+    episodes_per_iteration: int = number(512, 1, MOST)
+    """Episodes of a gathering iteration, of two optima each."""
+    label_seconds: float = number(5.0, 0)
+    """Part of an optimum that becomes samples, s."""
+    backoff: Backoff = Backoff(grip=EXECUTED.grip)
+    """What optima keep from their limits."""
+    gradient_steps: int = number(1500, 1, MOST)
+    """Gradient steps per iteration."""
+    batch_size: int = number(1024, 1, MOST)
+    """Samples per gradient step."""
+    learning_rate: float = number(3e-3, above=0)
+    """Learning rate; it falls along half a cosine."""
+    hidden: tuple[int, ...] = number((128, 128), 1, 2**14)
+    """Units of hidden layers."""
+    symmetry: RoutedSymmetry = "none"
+    """What the actor keeps of the task's symmetry."""
+
+
+TUNED: dict[str, DaggerConfig] = {
+    "": DaggerConfig(),
+    "stabilize": DaggerConfig(symmetry="odd"),
+    "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
+    # plans at the force limit leave no force for corrections
+    "orbit": DaggerConfig(symmetry="frame", hidden=(256, 256), backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
+    "weave": DaggerConfig(
+        symmetry="routes", hidden=(256, 256), backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip)
+    ),
+}
+"""Exceptions by name of task; every other task takes the defaults."""
+
+# of the expert's actions, and where the ball may slip: each episode draws the deviation of its noise from 0 to this
+_NOISE, _NOISE_IN_GRIP = 0.2, 0.05
+_STATES = 32  # of each optimum that become samples, on average
+_SMALL = 0.3  # of the force limit: a derivative is no guide to greater changes
+_WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
+# by which distances in a state are told, in SI units
+_SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
+_SAME_WAY = 1.5  # m between two ways that are the same
+_HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
+_MOST_ALONE = 16  # of the optima that pass obstacles on other sides than the learner shall
+_ROBOTS = 16  # of an iteration on a track
+_FINAL_LEARNING_RATE_FRACTION = 0.01
+_MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
+
+
+@dataclass(frozen=True)
+class _Optima:
+    """Optima of B episodes of at most n control steps as arrays.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | costs | (B,) | NaN where none was found |
+    | solved | (B,) bool | whether one was found |
+    | steps | (B,) | control steps, fewer than n where a goal is reached |
+    | states | (B, n+1, 8) | after its end an episode's last state is repeated |
+    | forces | (B, n, 2) | N |
+    | gains | (B, n, 2, 8) | as in `Optimum` |
+    """
+
+    costs: np.ndarray
+    solved: np.ndarray
+    steps: np.ndarray
+    states: np.ndarray
+    forces: np.ndarray
+    gains: np.ndarray
+
+    @classmethod
+    def none(cls, count: int, n: int, states: int, forces: int) -> "_Optima":
+        """Of `count` episodes, none of them solved."""
+        x, u, k = np.zeros((count, n + 1, states)), np.zeros((count, n, forces)), np.zeros((count, n, forces, states))
+        return cls(np.full(count, np.nan), np.zeros(count, bool), np.full(count, n), x, u, k)
+
+    def put(self, i: int, optimum: Optimum | None) -> None:
+        """Sets the optimum of one episode, if it was found."""
+        if optimum is not None and optimum.is_optimal:
+            plan, n = optimum.trajectory, len(optimum.trajectory.u)
+            self.costs[i], self.solved[i], self.steps[i] = optimum.cost, True, n
+            self.states[i] = plan.x[np.minimum(np.arange(self.states.shape[1]), n)]
+            self.forces[i, :n], self.gains[i, :n] = plan.u, optimum.gains
+
+
+class Dagger:
+    """The learner; see `training.Learner`. An iteration's random numbers depend on seed and iteration alone."""
+
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        config: DaggerConfig,
+        seed: int = 0,
+        demos: str | Path | None = None,
+        start: PolicyNetwork | None = None,
+        randomization: Randomization | None = None,
+        history: int = 0,
+    ):
+        """As of `Algorithm.make`. Demonstrations are its first samples."""
+        on_track, robot = randomization is not None or history > 0, registered_name(params)
+        samples = _first_samples(demos, task, robot, config, on_track)
+        self.config, self.iteration, self._warm = config, 0, start is not None
+        self.iterations, self.evaluations = config.iterations, config.evaluations
+        self._task, self._params, self._seed = task, params, seed
+        self._randomization, self._history = randomization or Randomization(), history
+        torch.manual_seed(seed)
+        self.network = actor_for(task, params, config, history, False, start)
+        self._fit = Fit(self.network)
+        none = np.zeros((0, self.network.spec.seen))
+        self._samples = Samples.of(none, np.zeros((0, params.action_size))) if samples is None else samples
+
+    def iterate(self) -> dict[str, float]:
+        config, figures, routes = self.config, {}, self.network.routes
+        if routes is not None and self.iteration == 0 and not self._warm:
+            fit_routes(routes, self._task, self._params, self._seed)
+        rng = np.random.default_rng([self._seed, self.iteration])
+        if self.iteration < config.gathering_iterations or not len(self._samples):
+            figures = self._gather(rng)
+        progress = self.iteration / config.iterations
+        rate = schedules.cosine(config.learning_rate, _FINAL_LEARNING_RATE_FRACTION, progress)
+        loss = self._fit.run(self._samples, config.gradient_steps, config.batch_size, rate, rng)
+        self.iteration += 1
+        return {"loss/imitation": loss, "train/learning_rate": rate, "train/samples": len(self._samples), **figures}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "iteration": self.iteration,
+            "samples": [self._samples.observations, self._samples.actions, self._samples.weights],
+            **self._fit.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.iteration = state["iteration"]
+        self._samples = Samples(*state["samples"])
+        self._fit.load_state_dict(state)
+
+    def _gather(self, rng: np.random.Generator) -> dict[str, float]:
+        """Labels the states of episodes: from their beginnings, and then, with new optima, from one that each came to."""
+        task, randomization, robots, drawn = self._task, self._randomization, [self._params], np.zeros((1, 0))
+        if randomization.varies_episodes:
+            draws = rng.random((_ROBOTS, len(Randomization.DRAWN)))
+            drawn = np.array([randomization.draw(tuple(z), task.control_dt) for z in draws])
+            robots = [randomization.robot(self._params, tuple(row)) for row in drawn.tolist()]
+        each = -(-self.config.episodes_per_iteration // len(robots))
+        robots, drawn = [robot for robot in robots for _ in range(each)], drawn.repeat(each, axis=0)
+        x, c = self._beginnings(len(robots), rng)
+        batch = BallbotBatch(
+            task, len(robots), compile=False, params=self._params, randomization=randomization, history=self._history
+        )
+        given = (torch.as_tensor(part.T, dtype=batch.dtype) for part in (x, c, drawn))
+        start = batch.initial_state(int(rng.integers(2**31)), None, *given)
+        states, lasted, optima = self._labelled_run(batch, start, robots, rng)
+        at = rng.integers(lasted)
+        reached = (
+            torch.stack([parts[k][..., i] for i, k in enumerate(at.tolist())], -1)
+            for parts in zip(*states, strict=True)
+        )
+        _, _, again = self._labelled_run(batch, BatchState(*reached), robots, rng, (optima, at))
+        return {"train/labelled": float(np.mean([optima.solved, again.solved]))}
+
+    def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Initial states (count, 8) and constants (count, nc). As far as there are some, a share are ones of many drawn in
+        which the learner does not succeed.
+        """
+        hard = round(_HARD_SHARE * count) if self.iteration else 0
+        some, among = count - hard, _HARD_AMONG * hard
+        x, c = map(np.array, zip(*(self._task.sample(rng, self._params) for _ in range(some + among)), strict=True))
+        if not hard:
+            return x, c
+        batch = BallbotBatch(self._task, among, compile=False, params=self._params, history=self._history)
+        success = run_episodes(batch, self.network, x[some:], c[some:]).success.numpy()
+        rows = np.append(np.arange(some), some + np.argsort(success, kind="stable")[:hard])
+        rng.shuffle(rows)
+        return x[rows], c[rows]
+
+    def _labelled_run(
+        self,
+        batch: BallbotBatch,
+        state: BatchState,
+        robots: Sequence[BallbotParams],
+        rng: np.random.Generator,
+        before: tuple[_Optima, np.ndarray] | None = None,
+    ) -> tuple[list[BatchState], np.ndarray, _Optima]:
+        """Runs B episodes from a state under expert or learner, and labels what is seen near the optimum of each.
+
+        Args:
+            before: the optima from the beginnings of the episodes, and how many control steps these have lasted, (B,).
+
+        Returns:
+            The states of all control steps, how many of them each episode lasted (B,), and the optima.
+        """
+        task, limits = self._task, np.array([[robot.force_limit] for robot in robots])
+        c = state.c.T.double().numpy()
+        x, sides = self._ahead(batch, state), self._sides(batch.observe(state))
+        optima = self._optima_of(robots, x, c)
+        if before is None:
+            others = np.flatnonzero(~self._passes(optima, c, sides))
+            for i in rng.permutation(others)[:_MOST_ALONE].tolist() if len(others) else ():
+                path = task.routed_path(x[i], c[i], sides[i])
+                with contextlib.suppress(PlanError):
+                    optima.put(i, find_optimum(task, robots[i], x[i], c[i], self.config.backoff, paths=[path]))
+        usable, costs = optima.solved & self._passes(optima, c, sides), optima.costs
+        if before is not None:
+            costs = np.where(before[0].solved, before[0].costs, costs)
+            usable &= _goes_on(optima, *before)
+        steps = max(1, round(self.config.label_seconds / task.control_dt))
+        expert = rng.random((len(robots), 1)) < 0.5
+        noise = (_NOISE_IN_GRIP if self._params.grips else _NOISE) * rng.random((len(robots), 1))
+        states, lasted, running = [], np.zeros(len(robots), int), np.ones(len(robots), bool)
+        seen, labels, weights = [], [], []
+        for k in range(min(steps, task.steps)):
+            states.append(state)
+            lasted += running
+            observation = batch.observe(state)
+            label, near = self._labels(optima, self._ahead(batch, state), k, limits)
+            near &= running & usable & (rng.random(len(near)) < _STATES / steps)
+            seen.append(observation[near])
+            labels.append(label[near])
+            weights.append(1 / np.maximum(costs[near], _MIN_COST))
+            with torch.no_grad():
+                actions = np.where(expert, label + noise * rng.standard_normal(label.shape), self.network(observation))
+            state, result = batch.transition(state, torch.as_tensor(actions))
+            running &= ~(result.terminated | result.truncated).numpy()
+            if not running.any():
+                break
+        self._samples.add(Samples.of(torch.cat(seen).numpy(), np.concatenate(labels), np.concatenate(weights)))
+        return states, lasted, optima
+
+    def _labels(self, optima: _Optima, x: np.ndarray, k: int, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The optimal actions (B, 2) in states x (B, 8) about control step k, and whether each state is near its optimum.
+
+        A policy does not know the time. So what counts is the nearest state of the optimum, which may be some steps away.
+        """
+        rows, window = np.arange(len(x)), round(_WINDOW / self._task.control_dt)
+        around = np.arange(max(0, k - window), min(optima.forces.shape[1], k + window + 1))
+        distances = (((x[:, None] - optima.states[:, around]) / _SPREAD[: x.shape[1]]) ** 2).sum(2)
+        distances[around >= optima.steps[:, None]] = np.inf
+        at = around[distances.argmin(1)]
+        change = -np.einsum("bij,bj->bi", optima.gains[rows, at], x - optima.states[rows, at])
+        near = (np.abs(change) < _SMALL * limits).all(1) & np.isfinite(distances.min(1))
+        return np.clip((optima.forces[rows, at] + change) / limits, -1, 1), near
+
+    def _optima_of(self, robots: Sequence[BallbotParams], x: np.ndarray, c: np.ndarray) -> _Optima:
+        """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours."""
+        found: list[Optimum | None] = []
+        for robot, rows in itertools.groupby(range(len(robots)), robots.__getitem__):
+            of = list(rows)
+            few: dict[str, int] = {} if robot.wheels is None else {"guesses": 1}  # each takes seconds
+            found += find_optima(self._task, robot, x[of], c[of], self.config.backoff, **few)
+        optima = _Optima.none(len(x), self._task.steps, x.shape[1], robots[0].action_size)
+        for i, optimum in enumerate(found):
+            optima.put(i, optimum)
+        return optima
+
+    def _sides(self, observation: torch.Tensor) -> list[tuple[int, ...]]:
+        """On which sides the learner's routes pass the obstacles of B episodes; for each none, if it has no routes."""
+        if self.network.routes is None:
+            return [()] * len(observation)
+        return [tuple(sides) for sides in self.network.routes(observation).int().tolist()]
+
+    def _passes(self, optima: _Optima, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """(B,) whether optima pass the obstacles ahead of their beginnings on these sides."""
+        passes = np.ones(len(c), bool)
+        for i, wanted in enumerate(sides):
+            if wanted:
+                obstacles, path = np.asarray(self._task.passed_obstacles(c[i])), optima.states[i]
+                mine, behind = sides_passed(path, obstacles), obstacles[:, 0] < path[0, 0]
+                passes[i] = ((np.array(mine) == wanted[: len(mine)]) | behind).all()
+        return passes
+
+    def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
+        """(B, 8) where the robots will be when a force of now arrives, after those that are on their way."""
+        x, commands = state.x.unbind(0), state.actuator[2:].unflatten(0, (-1, 2)) if len(state.actuator) > 2 else ()
+        robot = batch.model(state.drawn.unbind(0))
+        for age in range(len(commands), 0, -1):
+            dt = self._task.control_dt
+            later = dynamics.step(robot, x, commands[age - 1].unbind(0), dt, dynamics.substeps_for(dt))
+            x = tuple(torch.where(state.drawn[5] >= age, new, old) for new, old in zip(later, x, strict=True))
+        return torch.stack(x, 1).double().numpy()
+
+
+def _goes_on(optima: _Optima, before: _Optima, at: np.ndarray) -> np.ndarray:
+    """(B,) whether optima go where earlier ones, which began `at` (B,) control steps ago, went on to go, if there were any.
+
+    Where two ways cost about the same, a policy that changes its mind under way takes neither.
+    """
+    n = optima.states.shape[1]
+    then = before.states[np.arange(len(at))[:, None], np.minimum(at[:, None] + np.arange(n), n - 1)]
+    return (np.abs(optima.states - then)[..., :2].max((1, 2)) < _SAME_WAY) | ~before.solved
+
+
+def _first_samples(
+    demos: str | Path | None, task: Task, robot: str, config: DaggerConfig, on_track: bool
+) -> Samples | None:
+    """Demonstrations, if there are any; raises a ValueError where they do not fit."""
+    if demos is None:
+        if config.gathering_iterations:
+            return None
+        raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
+    if on_track:
+        raise ValueError(
+            "demonstrations show no past and no track; leave out --demos, or --randomization and --history"
+        )
+    loaded = load_demos(demos, task, robot)
+    weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
+    return Samples.of(loaded.observations, loaded.actions, weights)
+
+
+make = Dagger

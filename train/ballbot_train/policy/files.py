@@ -1,0 +1,281 @@
+"""What a policy's files say, readable without torch: which task it was made for, how it was trained, where it is.
+
+A policy is two files: weights in `NAME.safetensors` and their description in `NAME.json`.
+"""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, get_args, get_type_hints
+
+from ballbot_gym import files
+from ballbot_gym.checks import check_history
+from ballbot_gym.identity import digest, observation_digest
+from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS
+from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
+from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.symmetry import FRAMES, Frame
+
+OBSERVATION_VERSION = 1
+"""Raised whenever what any task observes changes, so that older policies are refused instead of misled."""
+
+SHIPPED = Path(__file__).parent.parent / "policies"
+"""Policies that come with the package, as TASK-LEARNER.json and .safetensors, or TASK-ROBOT-LEARNER for other robots."""
+
+BEST = {"stabilize": "shac", "turn": "shac", "orbit": "ppo", "weave": "shac"}
+"""The learner of each task's shipped policy with the least mean regret, for the paper's robot."""
+
+_MOST_LAYERS = 64
+_MOST_MIRRORS = 16
+_MOST_UNITS = 1_000_000  # of a layer
+_DESCRIPTION_LIMIT = 2**24  # bytes
+
+
+Mirrors = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+"""Signs of the observation and of the action in each mirror image."""
+
+
+class PolicyError(ValueError):
+    """A policy file that is missing, damaged, or belongs to another task or observation."""
+
+
+def _check_count(name: str, number: Any) -> None:
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= _MOST_UNITS:
+        raise ValueError(f"{name} must be whole numbers from 0 to {_MOST_UNITS}, not {number!r:.200}")
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """What a policy was made for and how its network is built; the JSON file holds it."""
+
+    task: str
+    """`Task.problem()` of what it was trained on."""
+    observations: int
+    """Size of an observation."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Units of the hidden layers."""
+    activation: Literal["tanh", "relu", "silu"] = "tanh"
+    """After each hidden layer."""
+    linear: bool = True
+    """Whether a linear part is added to the network's output."""
+    odd: bool = False
+    """Whether opposite observations get opposite actions, exactly: no biases. Needs an odd activation."""
+    frame: str | None = None
+    """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
+    routes: tuple[int, ...] = ()
+    """Units of the hidden layers of the network that decides on which sides obstacles are passed; for frames with a route."""
+    centred: bool = False
+    """Whether the action in the frame's steady motion is exactly the one that keeps it."""
+    mirrors: Mirrors = ()
+    """Mirror images over which the network's output is averaged."""
+    squash: Literal["tanh", "clip", "tanh_in_frame"] = "tanh"
+    """How the sum is brought into [−1, 1]. "tanh_in_frame" is that of `sac`: tanh, times `REACH`, in the frame, then clip."""
+    observation_version: int = OBSERVATION_VERSION
+    robot: str = PAPER
+    """Name in `ROBOTS` of the robot it was trained on."""
+    robot_numbers: str = ""
+    """All numbers of that robot, because two files may have one name; "" in files of earlier versions."""
+    observation_digest: str = ""
+    """`identity.observation_digest` of its task; "" in files of earlier versions."""
+    history: int = 0
+    """How many earlier observations and actions it sees; `history` of its env."""
+    informed: bool = False
+    """Whether it is told the robot, what `ROBOT_FACTORS` names, behind the observation. It runs behind a filter, which finds
+    that out, as in Yu et al., "Preparing for the unknown" (2017)."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.task, str):
+            raise ValueError(f"task must be text, not {self.task!r}")
+        if self.robot not in ROBOTS:
+            raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
+        if named_robot(self.robot).wheels is not None and (self.frame is not None or self.mirrors):
+            raise ValueError(f"{self.robot} has three wheels, and neither a frame nor mirror images")
+        for name in ("observations", "observation_version"):
+            _check_count(name, getattr(self, name))
+        check_history(self.history)
+        if self.history and (self.routes or self.informed):
+            raise ValueError("routes and informed policies know no history")
+        for name in ("hidden", "routes"):
+            layers = getattr(self, name)
+            if not isinstance(layers, tuple) or len(layers) > _MOST_LAYERS:
+                raise ValueError(f"{name} must be the units of at most {_MOST_LAYERS} layers, not {layers!r:.200}")
+            for units in layers:
+                _check_count(name, units)
+        for name in ("activation", "squash"):
+            known = get_args(get_type_hints(PolicySpec)[name])
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
+        for name in ("robot_numbers", "observation_digest"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} must be text, not {getattr(self, name)!r:.200}")
+        for name in ("linear", "odd", "centred", "informed"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be true or false, not {getattr(self, name)!r}")
+        if len(self.mirrors) > _MOST_MIRRORS:
+            raise ValueError(f"mirrors must be at most {_MOST_MIRRORS}, not {len(self.mirrors)}")
+        for signs, action in self.mirrors:
+            if len(signs) != self.observations or len(action) != self.actions or not {*signs, *action} <= {-1, 1}:
+                raise ValueError(
+                    f"mirrors must hold signs of {self.observations} observations and {self.actions} actions"
+                )
+        if self.odd and self.activation != "tanh":
+            raise ValueError(f"odd needs the activation tanh, not {self.activation}")
+        if self.frame not in (None, *FRAMES):
+            raise ValueError(f"no frame {self.frame!r}; known: {', '.join(FRAMES)}")
+        if bool(self.routes) != (self.seen_in is not None and self.seen_in.route is not None):
+            raise ValueError(
+                f"routes must be given for a frame with a route, and for no other, not for {self.frame!r:.200}"
+            )
+        if self.centred and (self.seen_in is None or self.seen_in.steady is None):
+            raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
+
+    @property
+    def seen_in(self) -> Frame | None:
+        """The frame in which the network sees and acts."""
+        return None if self.frame is None else FRAMES[self.frame]
+
+    @property
+    def actions(self) -> int:
+        """Numbers that the policy commands."""
+        return named_robot(self.robot).action_size
+
+    @property
+    def seen(self) -> int:
+        """Numbers that the policy takes: an observation, and behind it the past, or what it is told of the robot."""
+        told = len(ROBOT_FACTORS) if self.informed else 0
+        return self.observations + self.history * (self.observations + self.actions) + told
+
+    @classmethod
+    def read(cls, described: Mapping[str, Any]) -> "PolicySpec":
+        """The spec that a policy's JSON file describes, where JSON has lists in place of tuples.
+
+        Raises:
+            KeyError, TypeError, ValueError: it describes none.
+        """
+        fields: dict[str, Any] = {"routes": (), "mirrors": (), **described}
+        for name in ("hidden", "routes"):
+            if not isinstance(fields[name], list | tuple):
+                raise ValueError(f"{name} must be a list of whole numbers, not {fields[name]!r:.200}")
+            fields[name] = tuple(fields[name])
+        fields["mirrors"] = tuple((tuple(signs), tuple(action)) for signs, action in fields["mirrors"])
+        return cls(**fields)
+
+    @classmethod
+    def of(cls, task: Task, robot: str = PAPER, **fields: Any) -> "PolicySpec":
+        """The spec for a task and a robot by name; fields are the others."""
+        observations = task.observation_size(named_robot(robot))
+        spec = cls(task=task.problem(), observations=observations, robot=robot, **fields)
+        return spec.on(task, robot)
+
+    def on(self, task: Task, robot: str) -> "PolicySpec":
+        """The same network for a robot by name."""
+        params = named_robot(robot)
+        content = {"robot_numbers": repr(params), "observation_digest": observation_digest(task, params)}
+        return replace(self, robot=robot, **content)
+
+
+def read_description(path: str | Path) -> dict[str, Any]:
+    """What a policy's JSON file says; its `spec` holds the fields of a PolicySpec.
+
+    Args:
+        path: of either of the policy's files.
+
+    Raises:
+        PolicyError: it is missing or damaged.
+    """
+    _, description = paths_of(path)
+    if Path(path).suffix in (".pt", ".pth", ".ckpt"):
+        raise PolicyError(
+            f"{path} is no policy's .json, nor a model of Stable-Baselines3 in a .zip: load it where it was made, and give "
+            "ballbot_train.evaluate a function from observation to action"
+        )
+    try:
+        read = files.read_json(description, _DESCRIPTION_LIMIT)
+        if not isinstance(read["spec"], dict):
+            raise TypeError("its spec is no object")
+        if not isinstance(read["spec"]["task"], str):
+            raise TypeError("its spec names no task")
+        if not isinstance(read.get("training", {}), dict):
+            raise TypeError("its training is no object")
+    except KeyError as error:
+        raise PolicyError(f"{description} is not a policy: it has no {error}") from error
+    except (ValueError, TypeError) as error:
+        raise PolicyError(f"{description} is not a policy: {error}") from error
+    return read
+
+
+def way_of(path: str | Path) -> str:
+    """The whole way of a policy as its record tells it: all learners and demonstrators in turn, as "dagger → shac".
+
+    "" where the record holds no command of `ballbot train`.
+    """
+    training = read_description(path).get("training", {})
+    # "command" makes the policy anew by today's options; "made_by" is what made it, where that differs
+    command = str(training.get("made_by") or training.get("command"))
+    names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
+    return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])
+
+
+@lru_cache(maxsize=1)
+def shipped_ways() -> Mapping[str, str]:
+    """The whole way of each shipped policy, by the SHA-256 of its weights."""
+    return {weights_digest(path): way_of(path) for path in SHIPPED.glob("*.json")}
+
+
+def shipped_policies(task: Task, robot: str = PAPER, track: str | None = "") -> dict[str, Path]:
+    """The policies of a task and robot that come with the package: the paths of their .json by the learner's name.
+
+    Those that were trained on a track, as "shac-late", are among them where that track is given, and all where it is None.
+    """
+    name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
+    if name is None:
+        return {}
+    start = f"{file_name(name, robot)}-"
+    found = {path.stem.removeprefix(start): path for path in sorted(SHIPPED.glob(f"{start}*.json"))}
+    return {
+        learner: path
+        for learner, path in found.items()
+        if learner.partition("-")[0] not in ROBOTS and (track is None or track_in(learner) in ("", track))
+    }
+
+
+def track_in(name: str) -> str:
+    """The track that a policy's name says it was trained on, or ""."""
+    last = name.rpartition("-")[2]
+    return last if last in TRACKS else ""
+
+
+def weights_digest(path: str | Path) -> str:
+    """SHA-256 of a policy's weights, or of a saved model, as hexadecimal digits; raises a PolicyError if they are missing."""
+    weights = path if Path(path).suffix == ".zip" else paths_of(path)[0]
+    try:
+        return hashlib.sha256(files.read(weights)).hexdigest()
+    except files.FileError as error:
+        raise PolicyError(f"{weights} is not a policy: {error}") from error
+
+
+def content_digest(path: str | Path) -> str:
+    """Digest of what a policy does: its weights, and the network that its description says."""
+    return digest(weights_digest(path), network_digest(path))
+
+
+def network_digest(path: str | Path) -> str:
+    """Digest of the network that a policy's JSON file describes; "" of a saved model, whose only file has the weights too."""
+    return "" if Path(path).suffix == ".zip" else digest(read_description(path)["spec"])
+
+
+def is_run(path: Path) -> bool:
+    """Whether a path is the folder of a training run that has a policy."""
+    return (path / "policy.json").is_file()
+
+
+def paths_of(path: str | Path) -> tuple[Path, Path]:
+    """The paths of a policy's weights and of its description, given either, the name without an ending, or a run's folder."""
+    path = Path(path)
+    if is_run(path):
+        path = path / "policy"
+    stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
+    return stem.with_name(stem.name + ".safetensors"), stem.with_name(stem.name + ".json")

@@ -1,0 +1,374 @@
+"""Learned policies: the network, loading and saving it, and the policy as a Controller.
+
+A policy is two files: weights in `NAME.safetensors` and their description in `NAME.json`. Nothing in them is executed.
+This module imports torch; `policy_files` reads descriptions without it.
+"""
+
+import functools
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.env import make_task
+from ballbot_gym.identity import observation_digest
+from ballbot_gym.lazy import imports_of
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
+from ballbot_gym.rollout import ActionController
+from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.symmetry import REACH, Route
+from ballbot_train.policy.files import (
+    OBSERVATION_VERSION,
+    PolicyError,
+    PolicySpec,
+    paths_of,
+    read_description,
+)
+from ballbot_train.policy.weights import checked, linear_layers, own_precision
+
+with imports_of(__name__):
+    import safetensors
+    import safetensors.torch
+    import torch
+
+if TYPE_CHECKING:
+    from ballbot_gym.batch import BatchState
+
+_TOLD = len(ROBOT_FACTORS)
+_TOLD_SCALE = 0.3  # of what informed policies are told, less 1
+_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
+
+
+class PolicyNetwork(torch.nn.Module):
+    """action = squash(W o + MLP(o)): the sum of a linear part, which LQR's gain can initialize, and a network.
+
+    Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit; with wheels (..., 3).
+    With a frame, o and the action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so
+    it mirrors exactly. A centred policy takes from the sum what it is in the steady motion in which the episode shall end,
+    and adds the action that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a
+    network of its own decides on which sides obstacles are passed.
+
+    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in. An
+    informed policy takes what it is told of the robot behind the observation, and its forces are those of the nominal motors.
+    """
+
+    def __init__(self, spec: PolicySpec, device: str = "cpu"):
+        super().__init__()
+        self.spec = spec
+        own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
+        told, none = [1] * _TOLD * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
+        self._mirrors = [
+            (torch.tensor([*signs, *(spec.history * (*signs, *action)), *told], **own), torch.tensor(action, **own))
+            for signs, action in (*spec.mirrors, *[none] * (spec.odd and spec.informed))
+        ]
+        self._frame = spec.seen_in
+        self.present = spec.observations if self._frame is None else self._frame.size
+        """Numbers of the present observation as the frame shows it."""
+        self.routes = None
+        if self._frame is not None and self._frame.route is not None:
+            self.routes = Routes(self._frame.route, spec.routes, device)
+        inputs = self.present + spec.history * (self.present + spec.actions) + _TOLD * spec.informed
+        self.linear = torch.nn.Linear(inputs, spec.actions, bias=not spec.odd, **own) if spec.linear else None
+        widths = (inputs, *spec.hidden, spec.actions)
+        self.mlp = linear_layers(widths, _ACTIVATIONS[spec.activation], bias=not spec.odd, **own)
+        if spec.linear:  # so that the policy starts as its linear part
+            for part in self.mlp[-1].parameters():
+                torch.nn.init.zeros_(part)
+
+    @property
+    def history(self) -> int:
+        """The number of earlier observations and actions that follow the present observation."""
+        return self.spec.history
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        raw = self.raw(observation)
+        return torch.tanh(raw) if self.spec.squash == "tanh" else raw.clamp(-1.0, 1.0)
+
+    def knowing(self, observation: torch.Tensor, state: "BatchState", track: Randomization) -> torch.Tensor:
+        """Actions (B, 2) for observations (B, no) without what an informed policy is told of the robots. That is what `track`
+        drew for them, as a filter tells it: in the first control step, when nothing is known yet, what is drawn on average.
+        """
+        if not self.spec.informed:
+            return self(observation)
+        told = state.drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T.to(observation.dtype)
+        expected = told.new_tensor([sum(getattr(track, name)) / 2 for name in ROBOT_FACTORS])
+        told = torch.where(state.steps[:, None] == 0, expected, told)
+        return self(torch.cat([observation, told], -1)) / told[:, -1:]
+
+    def raw(self, observation: torch.Tensor) -> torch.Tensor:
+        """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
+        told = observation[..., :0]
+        if self.spec.informed:
+            observation, told = observation[..., :-_TOLD], (observation[..., -_TOLD:] - 1.0) / _TOLD_SCALE
+        if self._frame is not None:
+            # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
+            plain = observation.ndim == 1 and torch.is_inference_mode_enabled()
+            features, back = self.features(self._seen(observation, plain))
+            features = (*features, *(told.tolist() if plain else told.unbind(-1)))
+            action = self.centred(self._sum(stacked(features, observation)), features)
+            if self.spec.squash == "tanh_in_frame":
+                action = REACH * torch.tanh(action)
+            return stacked(back(tuple(action.tolist()) if plain else action.unbind(-1)), observation)
+        if self.spec.informed:
+            observation = torch.cat([observation, told], -1)
+        total = self._sum(observation)
+        for signs, action_signs in self._mirrors:
+            total = total + action_signs * self._sum(signs * observation)
+        return total / (1 + len(self._mirrors)) if self._mirrors else total
+
+    def _seen(self, observation: torch.Tensor, plain: bool = False) -> tuple[Any, ...]:
+        """The numbers of an observation, and behind them the sides of routes, if any."""
+        numbers = tuple(observation.tolist()) if plain else observation.unbind(-1)
+        return numbers if self.routes is None else (*numbers, *self.routes.sides(numbers))
+
+    def features(self, observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
+        """Features of the present observation, and behind them those of the past ones with their actions; the way back."""
+        assert self._frame is not None
+        count, own = self.spec.history, self.spec.observations
+        if not count:
+            return self._frame.features(observation)
+        features, back = self._frame.features(observation[:own])
+        for k in range(count):
+            first = own + k * (own + 2)
+            then, back_then = self._frame.features(observation[first : first + own])
+            x, y = observation[first + own : first + own + 2]
+            one = 0.0 * x + 1.0
+            axes = (back_then((one, 0.0 * x)), back_then((0.0 * x, one)))  # orthonormal
+            features = (*features, *then, *(a * x + b * y for a, b in axes))
+        return features, back
+
+    def shown(self, observation: torch.Tensor) -> torch.Tensor:
+        """(B, no + past) to (B, `present` + past): the present observation as the frame shows it, the past as it is."""
+        if self._frame is None:
+            return observation
+        own, past = observation[..., : self.spec.observations], observation[..., self.spec.observations :]
+        features, _ = self._frame.features(self._seen(own))
+        return torch.cat([stacked(features, observation), past], -1)
+
+    def centred(self, output: torch.Tensor, features: tuple[Any, ...]) -> torch.Tensor:
+        """The network's output (..., 2) for features of its frame, before it is squashed. A centred policy's is less what the
+        network gives in the steady motion, and has what keeps that motion instead.
+        """
+        if not self.spec.centred:
+            return output
+        kept, action = self.kept(features)
+        output = output - self._sum(stacked(kept, output))
+        needed = stacked(action, output)
+        if self.spec.squash != "clip":
+            reach = REACH if self.spec.squash == "tanh_in_frame" else 1
+            needed = (needed / reach).clamp(-0.999, 0.999).atanh()
+        return output + needed
+
+    def kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+        """Features of the steady motion, as if it had gone on for all of the history, and the action that keeps it."""
+        assert self._frame is not None
+        assert self._frame.steady is not None
+        kept, action = self._frame.steady(features[: self.present])
+        told = features[self.present :] if self.spec.informed else ()
+        return (*kept, *(self.spec.history * (*kept, *action)), *told), action
+
+    def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
+        output = self.mlp(inputs)
+        return output if self.linear is None else output + self.linear(inputs)
+
+
+class Routes(torch.nn.Module):
+    """From observations to the sides on which obstacles are passed, by a small network that knows only where these lie.
+
+    A choice of sides is the best of several basins, and a network that averages basins hits what lies between them. So the
+    choice is made apart, as a classification. The layout stays the same throughout an episode, so the choice does not waver.
+    Its outputs, before the greatest is taken, belong to the 2^n choices of obstacles that are passed on the farther side.
+    """
+
+    def __init__(self, route: Route, hidden: tuple[int, ...], device: str = "cpu"):
+        """Args: route: of a frame; hidden: units of the hidden layers; device: of the weights."""
+        super().__init__()
+        own: dict[str, Any] = {"device": device, "dtype": torch.float32}
+        self.route = route
+        self.mlp = linear_layers((3 * route.obstacles, *hidden, 2**route.obstacles), torch.nn.Tanh, **own)
+        self._choices: torch.Tensor
+        self.register_buffer("_choices", torch.tensor(farther_choices(route.obstacles), **own), persistent=False)
+
+    def layout(self, observation: torch.Tensor) -> torch.Tensor:
+        """(..., 3 n) x, y and radius of every obstacle as seen from the goal, of observations (..., no)."""
+        return torch.stack(self.route.layout(observation.unbind(-1)), -1)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """(..., n) 1 for every obstacle that is passed on its left, −1 on its right, of observations (..., no)."""
+        return torch.stack(self.sides(observation.unbind(-1)), -1)
+
+    def sides(self, seen: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The same (n) for the numbers of an observation (no), which are tensors or plain ones. No gradient reaches them."""
+        with torch.no_grad():
+            best = self.mlp(stacked(self.route.layout(seen), self._choices)).argmax(-1)
+            if isinstance(seen[0], torch.Tensor):
+                return self.route.sides(seen, self._choices[best].unbind(-1))
+            return self.route.sides(seen, farther_choices(self.route.obstacles)[int(best)])
+
+
+def stacked(values: Sequence[Any], like: torch.Tensor) -> torch.Tensor:
+    """(..., n) of n tensors (...), or of n plain numbers a tensor as another one is."""
+    return torch.stack(tuple(values), -1) if isinstance(values[0], torch.Tensor) else like.new_tensor(values)
+
+
+@functools.cache
+def farther_choices(obstacles: int) -> tuple[tuple[float, ...], ...]:
+    """Every choice of obstacles that are passed on their farther side, −1, in the order of the outputs."""
+    return tuple(itertools.product((1.0, -1.0), repeat=obstacles))
+
+
+class PolicyController(ActionController):
+    """A policy as a Controller of forces, and with Stable-Baselines3's `predict` of actions."""
+
+    def __init__(self, task: Task, params: BallbotParams, network: torch.nn.Module):
+        """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
+        history = getattr(network, "history", 0)
+        super().__init__(task, params, self._action_for, history)
+        self.network = network.eval()
+        if isinstance(network, PolicyNetwork) and network.spec.informed:
+            self.told = np.ones(_TOLD)
+
+    def _action_for(self, observation: np.ndarray, begins: bool) -> np.ndarray:
+        return self.predict(observation)[0]
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Actions (..., 2) for observations (..., no); the other arguments are SB3's and have no effect."""
+        with own_precision(), torch.inference_mode():
+            given = torch.as_tensor(np.array(observation), dtype=torch.float32, device="cpu")
+            return self.network(given).numpy(), state
+
+
+def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[str, Any]) -> Path:
+    """Writes `path`.safetensors and `path`.json.
+
+    Args:
+        path: with or without the ending .json.
+        network: the policy.
+        description: what else the JSON says: the training's configuration, its command, the measured regret.
+
+    Returns:
+        The path of the JSON file.
+    """
+    weights_path, description_path = paths_of(path)
+    weights = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    files.write(weights_path, safetensors.torch.save(weights))
+    return files.write(description_path, json.dumps({"spec": asdict(network.spec), **description}, indent=1) + "\n")
+
+
+def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> PolicyNetwork:
+    """The network of a policy file made for this very task and robot.
+
+    Args:
+        path: of either of its files.
+        task: what it must have been trained on.
+        robot: by name; None admits every robot, and with it other fields of the task.
+
+    Raises:
+        PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
+    """
+    weights_path, description_path = paths_of(path)
+    described = read_description(path)["spec"]
+    try:
+        spec = PolicySpec.read(described)
+    except (KeyError, ValueError, TypeError) as error:
+        lacks = "its spec has no " if isinstance(error, KeyError) else ""
+        raise PolicyError(f"{description_path} is not a policy: {lacks}{error}") from error
+    trained_on, wanted = (text.split("(")[0] if robot is None else text for text in (spec.task, task.problem()))
+    if trained_on != wanted:
+        raise PolicyError(f"{description_path} was trained on {trained_on}, not on {wanted}")
+    if robot is not None and spec.robot != robot:
+        raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")
+    if spec.observation_version != OBSERVATION_VERSION:
+        raise PolicyError(
+            f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
+            "train it anew"
+        )
+    _check_content(description_path, spec, task)
+    observations = task.observation_size(named_robot(spec.robot))
+    if spec.observations != observations:
+        raise PolicyError(f"{description_path} takes {spec.observations} observations, {task.id} has {observations}")
+    weights = _read_weights(weights_path)
+    # shapes without memory, which a wrong description would ask for
+    shapes = {name: tuple(part.shape) for name, part in PolicyNetwork(spec, "meta").state_dict().items()}
+    found = {name: tuple(part.shape) for name, part in weights.items()}
+    differing = [name for name in {**shapes, **found} if shapes.get(name) != found.get(name)]
+    if differing:
+        name = differing[0]
+        raise PolicyError(
+            f"{weights_path}: the weights do not fit their description: {name} has the shape {found.get(name)}, "
+            f"and should have {shapes.get(name)}"
+        )
+    network = PolicyNetwork(spec)
+    network.load_state_dict(weights)
+    return network
+
+
+def _check_content(path: Path, spec: PolicySpec, task: Task) -> None:
+    """Raises a PolicyError where another robot, or another observation, has the name of that on which a policy was trained.
+
+    Files of earlier versions hold neither, and are compared by name and size alone.
+    """
+    params = named_robot(spec.robot)
+    if spec.robot_numbers not in ("", repr(params)):
+        own, here = (set(text.split("(", 1)[1].rstrip(")").split(", ")) for text in (spec.robot_numbers, repr(params)))
+        raise PolicyError(
+            f"{path} was trained on a robot {spec.robot!r} with {', '.join(sorted(own - here))}, and the robot of this name "
+            f"has {', '.join(sorted(here - own))} here; give the robot that it was trained on, or train again"
+        )
+    if spec.observation_digest not in ("", observation_digest(task, params)):
+        raise PolicyError(
+            f"{path} was trained on other observations: {task.id} now observes other values in the same states; restore its "
+            "`observe`, or train again"
+        )
+
+
+def _read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The weights of a file; raises a PolicyError that names what is no number."""
+    try:
+        return checked(safetensors.torch.load(files.read(path)), path)
+    except PolicyError:
+        raise
+    # safetensors answers some files with a KeyError, or with an error that torch raises
+    except (ValueError, KeyError, TypeError, RuntimeError, safetensors.SafetensorError) as error:
+        raise PolicyError(f"{path} is not a policy: {error}") from error
+
+
+def load_policy(
+    path: str | Path, task: str | Task | None = None, params: BallbotParams | None = None
+) -> PolicyController:
+    """The policy of a file as a Controller with SB3's `predict`.
+
+    Args:
+        path: of either of its files.
+        task: what it must have been trained on; default, the registered task, with default fields, that its file names.
+        params: the robot; default, the one that its file names.
+
+    Raises:
+        PolicyError: as `load_network`; or no task is given, and its file names none that is registered.
+    """
+    spec = read_description(path)["spec"]
+    robot = spec.get("robot", PAPER) if params is None else robot_name(params)
+    if not isinstance(robot, str) or robot not in ROBOTS:
+        raise PolicyError(f"{path} was trained on the robot {robot!r}, which is none of {', '.join(ROBOTS)}")
+    if task is None:
+        task = next(
+            (each for each in (make_task(name, robot) for name in TASKS) if each.problem() == spec["task"]), None
+        )
+        if task is None:
+            raise PolicyError(f"{path} was trained on {spec['task']}: give that Task as load_policy(path, task)")
+    task = make_task(task, robot)
+    params = named_robot(robot) if params is None else params
+    return PolicyController(task, params, load_network(path, task, robot))

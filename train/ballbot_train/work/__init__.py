@@ -1,0 +1,1 @@
+"""Long work: processes and clusters, resumable jobs, shards, and what the terminal shows."""
