@@ -64,8 +64,8 @@ def room(module):
     """
     top, *inner = module.split(".")
     below = inner[0] if inner else ""
-    if top == "ballbot_baselines":
-        return below if below in ROOMS else top
+    if top != "ballbot_train":
+        return below if top == "ballbot_baselines" and below in ROOMS else top if top in PACKAGES else None
     return "commands" if below == "cli" else below if below in ROOMS else top
 
 
