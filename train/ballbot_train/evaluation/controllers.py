@@ -15,7 +15,7 @@ import numpy as np
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot, robot_name
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.policy import files as policy_files
@@ -51,6 +51,18 @@ def plain(name: str) -> str:
 def _filter_of(name: str) -> str:
     """Which of `FILTERS` a name ends with, or ""."""
     return next((ending for ending in _experts().FILTERS if name.endswith(ending)), "")
+
+
+def of_other_robot(name: str, task: Task) -> str:
+    """What to type for a policy of a task that comes with the package for other robots; "" of another name."""
+    robots = [robot for robot in ROBOTS if name in shipped_policies(task, robot, None)]
+    if not robots:
+        return ""
+    plural = "s" if len(robots) > 1 else ""
+    return (
+        f"it was made for the robot{plural} {', '.join(robots)}: `ballbot transfer --made-for {robots[0]} "
+        f"--controllers {name} --robot YOURS` runs it on yours"
+    )
 
 
 def is_expert(name: str) -> bool:
@@ -202,9 +214,8 @@ def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
     robot = robot_name(params)
     shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):
-        raise ValueError(
-            f"unknown controller {name!r}; {task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
-        )
+        known = f"{task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
+        raise ValueError(f"unknown controller {name!r}; {of_other_robot(name, task) or known}")
     if is_saved_model(name):
         from ballbot_train.policy.network import PolicyController  # it imports torch
         from ballbot_train.policy.saved_models import load_actor
@@ -346,6 +357,9 @@ def controllers_by_robot(
     unused = [name for name in given if name not in used]
     if unused and is_file(unused[0]):
         raise ValueError(f"{unused[0]} was made for {made_for(unused[0])}, which is none of {', '.join(tasks)}")
+    for task in tasks if unused else ():
+        if hint := of_other_robot(unused[0], make_task(task, robots[0])):
+            raise ValueError(f"unknown controller {unused[0]} for the robot {robots[0]}; {hint}")
     check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
     return chosen
 
