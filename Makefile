@@ -11,6 +11,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs notebooks pictures gallery certify clients pythons ray clean
+.PHONY: platforms code dist cross release metadata
 
 demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
@@ -29,9 +30,9 @@ pytest: $(VENV)/installed
 test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
 
-# the submissions that lie beside rows of the leaderboard
+# the submissions that lie beside rows of the leaderboard; with RECORDINGS=FOLDER also those of releases, downloaded there
 verify: $(VENV)/installed
-	$(BIN)/pytest tests/test_submissions.py -k "beside or row"
+	BALLBOT_RECORDINGS=$(RECORDINGS) $(BIN)/pytest tests/test_submissions.py -k "beside or row"
 
 # one page with all figures of speed, beside those of the last page of another commit
 bench: $(VENV)/installed
@@ -96,6 +97,40 @@ python-%: .venv-pythons/uv/bin/uv
 	.venv-pythons/$*/bin/python -m pytest -m "not slow" -k "not spec_of_an_env and not vector and not display" $(APPLY)
 	sed '1,/^```python/d; /^```/,$$d' README.md | .venv-pythons/$*/bin/python -
 	.venv-pythons/$*/bin/pip install --dry-run --quiet --only-binary=:all: -e ".[train]"
+
+# whether all that is needed has wheels on every system and Python; the registry is asked, and nothing is installed
+platforms: .venv-pythons/uv/bin/uv
+	python3 release/platforms.py .venv-pythons/uv/bin/uv
+
+# the C code of all shipped robots and tasks
+code: build/code/codes.json
+
+build/code/codes.json: $(VENV)/installed $(shell find ballbot_gym baselines -name "*.py" -o -name "*.[ch]")
+	rm -rf build/code
+	$(BIN)/python release/generated.py build/code
+
+# what is published, in dist/: the source, a wheel for every machine, and one with compiled code for machines like this one. Each
+# is installed in new environments outside of the repository, and used without a compiler and without a home.
+dist: build/code/codes.json
+	$(INSTALL) build twine
+	$(BIN)/python release/wheels.py build/code dist
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python release/check_dist.py dist
+
+# that code compiled for every system and processor, without a warning
+cross: build/code/codes.json
+	$(INSTALL) ziglang
+	$(BIN)/python release/cross.py build/code
+
+# what other sites list: Croissant, Zenodo and the scores of Minari's datasets
+metadata: $(VENV)/installed
+	$(BIN)/python release/metadata.py
+
+# checks that this version can be published, builds it, and prints the notes of its tag
+release: $(VENV)/installed
+	$(BIN)/python release/version.py check
+	$(MAKE) dist
+	$(BIN)/python release/version.py notes
 
 # Ray clusters of two nodes on this machine, with nodes that are killed
 ray: $(VENV)/installed

@@ -1,15 +1,19 @@
 """What vector envs do where episodes end: a step of a `BallbotBatch` in each of Gymnasium's modes, and what infos say."""
 
+from __future__ import annotations
+
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, tilt_of
+from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite
 
-# isort: split
-import torch  # after our modules, whose errors name the extra that brings it
+if TYPE_CHECKING:
+    import torch
+
+    from ballbot_gym.batch import BallbotBatch, BatchStep
 
 _NOTHING_DONE = ("reward", "cost", "terminated", "truncated", "success", "failure", "force", "clipped", "grip")
 """Fields of a `BatchStep` that are 0 of an env that waits."""
@@ -36,6 +40,10 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
         ValueError: an action is not finite; the envs stay as they are.
         gymnasium.error.ResetNeeded: before the first reset.
     """
+    import torch  # there is a batch, so it is there
+
+    from ballbot_gym.batch import tilt_of
+
     check_finite(actions)
     actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
     before: Any = batch.state
@@ -100,6 +108,8 @@ def masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
 
 
 def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None) -> BatchStep:
+    import torch
+
     if waiting is None:
         return batch.step(actions)
     wait = torch.from_numpy(waiting).to(batch.device)
@@ -175,7 +185,7 @@ def filled(value: Any, size: int) -> np.ndarray:
 
 def as_array(part: Any) -> np.ndarray:
     """A tensor, or an array, as an array."""
-    return part if isinstance(part, np.ndarray) else part.cpu().numpy()
+    return part if isinstance(part, np.ndarray) else part.detach().cpu().numpy()
 
 
 def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:

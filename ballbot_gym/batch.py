@@ -19,6 +19,7 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import counter_rng, dynamics, sensors
+from ballbot_gym.batch_state import BatchState, check_starts
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
@@ -27,7 +28,7 @@ from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import first_violated, limit_names, outcome
+from ballbot_gym.tasks.transition import limit_names, outcome
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -53,30 +54,6 @@ _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 
 _FIXED = ("task", "params", "randomization", "history", "observation", "num_envs", "device", "dtype", "limit_names")
 """Attributes of a batch that cannot be set once it is made: more is computed from them."""
-
-
-class BatchState(NamedTuple):
-    """Everything that a batch of B environments remembers."""
-
-    x: torch.Tensor
-    """(8, B) states; order and units in `dynamics.STATE`; with wheels (11, B), in `dynamics.OMNI_STATE`."""
-    c: torch.Tensor
-    """(nc, B) constants of the running episodes."""
-    steps: torch.Tensor
-    """(B,) int64, control steps taken in the running episodes."""
-    episode: torch.Tensor
-    """(B,) int64, number of the running episode since the env was seeded."""
-    seed: torch.Tensor
-    """(B,) int64."""
-    drawn: torch.Tensor
-    """(6 or 14, B) what `Randomization.draw` drew for the running episodes; (0, B) where it draws nothing."""
-    actuator: torch.Tensor
-    """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
-    past: torch.Tensor
-    """(history (no + 2), B) the last observations, each with the action that followed, the latest first; before the
-    episode began the first one, with no force."""
-    sensors: torch.Tensor
-    """(17, B) what sensors remember; (0, B) where the state is observed."""
 
 
 _Rows = Any
@@ -283,6 +260,10 @@ class BallbotBatch:
     def observe(self, state: BatchState) -> torch.Tensor:
         """(B, no) observations of a state, with the sensors' noise. A pure function."""
         return self._observe(_rows(state))
+
+    def tilt(self, state: BatchState) -> torch.Tensor:
+        """(B,) tilt, rad, of a state; see `tilt_of`."""
+        return tilt_of(state.x.unbind(0))
 
     def sensed(self, state: BatchState) -> torch.Tensor:
         """(8, B) states as sensors report them, with the noise that `observe` shows. A pure function."""
@@ -508,17 +489,6 @@ def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
         return a if a is b else torch.where(mask, a, b)
 
     return BatchState(*map(chosen, new, old))
-
-
-def check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:
-    """Raises a ValueError if states in 8 rows (B,) violate a limit of the task where the mask holds."""
-    violated = first_violated(task.limits(x, task.at(c, 0 * x[0])))
-    bad = [i for i, is_bad in enumerate((mask & (violated >= 0)).tolist()) if is_bad]
-    if bad:
-        raise ValueError(
-            f"start states of envs {bad[:8]} violate limits of {task.id}: that of env {bad[0]} the limit of "
-            f"{task.limit_names[int(violated[bad[0]])]}"
-        )
 
 
 def tilt_of(x: tuple) -> torch.Tensor:

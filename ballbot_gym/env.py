@@ -21,16 +21,16 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
+from ballbot_gym.drawing.picture import picture
+from ballbot_gym.drawing.viewer import Viewer, can_show, need_library
 from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import ENGINE, Outcome, limit_names, outcome
-from ballbot_gym.viewer import Viewer, has_viser, import_viser
 
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _NOTHING_DONE = Outcome(0.0, -0.0, *(0.0,) * 5, violated=-1.0)  # whose reward_cost is 0.0
@@ -174,7 +174,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             ValueError: an unknown task, physics or render mode, or a task field out of its range.
             TypeError: a keyword that is no field of the task.
             ImportError: physics="bullet" without a usable PyBullet, "mujoco" without MuJoCo, or render_mode="human" without
-                viser.
+                the extra "play".
         """
         self._page: Viewer | None = None
         self._state: State = ()  # until the first reset
@@ -183,11 +183,11 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         if render_mode == "human":
-            import_viser()
+            need_library()
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
-        modes, fps = ["human", "rgb_array"] if has_viser() else ["rgb_array"], round(1 / self.task.control_dt)
+        modes, fps = ["human", "rgb_array"] if can_show() else ["rgb_array"], round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.randomization = checked_randomization(randomization, self.params)

@@ -5,18 +5,21 @@ episodes, rounded to nine digits so that machines agree. A comment or a rewritte
 """
 
 import hashlib
+import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 
-_PROBES = 8  # states and episodes at which a task is compared
+_PROBES = 8  # episodes at which a task is compared
+_SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)  # m, rad and per second, of states at which it is compared
+_TIMES = (0.0, 0.5, 2.0, 5.0, 7.9)  # s
 _DIGITS = 9
 
 
@@ -26,52 +29,94 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def robot_digest(params: BallbotParams) -> str:
-    """Digest of all numbers of a robot."""
-    return digest(repr(params))
-
-
+@np.errstate(all="ignore")  # far from every episode a task need not give numbers
 def observation_digest(task: Task, params: BallbotParams) -> str:
-    """Digest of the observations of a task at fixed states and constants.
+    """Digest of the observations of a task at fixed states and times, and at constants.
 
-    These are not drawn by the task, so that robots with other episodes share a digest where they observe the same.
+    Of the constants, some are fixed numbers, and some are drawn as the task draws them by default for a shipped robot. So
+    robots and tasks with other episodes share a digest where they observe the same.
     """
-    rng, digits = np.random.default_rng(2), []
-    for _ in range(_PROBES):
-        x, c = rng.uniform(0.1, 0.9, params.state_size), rng.uniform(1.0, 2.0, len(task.constant_names))
-        digits.append(_rounded(task.seen(x, np.asarray(task.at(c, 0.5)))))
+    rng, names, usual = np.random.default_rng(2), len(task.constant_names), _with_default_fields(task)
+    robot = named_robot(PAPER if params.wheels is None else "omni")
+    digits = []
+    for x, time in _anywhere(rng, params):
+        drawn = usual.draw_constants(tuple(rng.random(task.constant_draws).tolist()), robot)
+        for c in (rng.uniform(1.0, 2.0, names), np.array(drawn, np.float64)):
+            digits.append(_rounded(task.seen, x, np.asarray(task.at(c, time))))
     return digest(digits)
 
 
-def problem_digest(task: Task, params: BallbotParams) -> str:
-    """Digest of a robot and of a task's episodes, costs, limits, goal and observations.
+PARTS = ("robot", "fields", "episodes", "costs", "limits", "goal", "observations")
+"""Of a problem, each with a digest of its own. A part may change those behind it too."""
+
+
+@np.errstate(all="ignore")
+def problem_parts(task: Task, params: BallbotParams) -> dict[str, str]:
+    """Digests of a robot, and of a task's fields, episodes, costs, limits, goal and observations, by `PARTS`.
 
     Two tasks that share a name and differ in a cost have different digests, and so have two robots of one name.
     """
-    values = [
-        [_rounded([task.cost(x, u, c), *task.limits(x, c), *task.goal(x, c), *np.ravel(task.seen(x, c))])]
-        for x, u, c in _probes(task, params)
-    ]
-    rng = np.random.default_rng(0)
-    episodes = [[_rounded(part) for part in task.sample(rng, params)] for _ in range(_PROBES)]
-    fields = [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit]
-    return digest(fields, robot_digest(params), values, episodes)
+    probes, rng = list(_probes(task, params)), np.random.default_rng(0)
+    values = (
+        [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit],
+        [[_digits(part) for part in task.sample(rng, params)] for _ in range(_PROBES)],
+        [_rounded(task.cost, *probe) for probe in probes],
+        *([_rounded(of, x, c) for x, _, c in probes] for of in (task.limits, task.goal, task.seen)),
+    )
+    return {name: digest(part) for name, part in zip(PARTS, (repr(params), *values), strict=True)}
 
 
-def named_problem_digest(task: str, robot: str) -> str:
-    """`problem_digest` of a task and a robot by name."""
-    return problem_digest(make_task(task, robot), named_robot(robot))
+def problem_digest(task: Task, params: BallbotParams) -> str:
+    """One digest of all parts of a problem."""
+    return digest(problem_parts(task, params))
 
 
-def _probes(task: Task, params: BallbotParams) -> Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Fixed states, forces, and constants as `Task.at` gives them: those of drawn episodes, moved by some tenths."""
+def named_problem(task: str, robot: str) -> dict[str, str]:
+    """`problem_parts` of a task and a robot by name."""
+    return problem_parts(make_task(task, robot), named_robot(robot))
+
+
+def changed_parts(held: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
+    """Names of the parts of a problem that differ. Those that may follow from a changed robot, or from changed episodes, are
+    not named.
+    """
+    changed = [name for name in PARTS if held.get(name) != wanted.get(name)]
+    first = next((name for name in ("robot", "episodes") if name in changed), None)
+    return changed if first is None else [name for name in changed if name in (first, "fields")]
+
+
+def _probes(task: Task, params: BallbotParams) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Fixed states, forces, and constants as `Task.at` gives them: of drawn episodes, near their starts and anywhere."""
     rng = np.random.default_rng(1)
-    for _ in range(_PROBES):
-        x, c = task.sample(rng, params)
-        x = x + rng.uniform(-0.3, 0.3, x.shape)
-        u = params.force_limit * rng.uniform(-1, 1, params.action_size)
-        yield x, u, np.asarray(task.at(c, 0.5))
+    starts = [task.sample(rng, params) for _ in range(_PROBES)]
+    near = [(x + rng.uniform(-0.3, 0.3, x.shape), c, 0.5) for x, c in starts]
+    anywhere = [(x, task.sample(rng, params)[1], time) for x, time in _anywhere(rng, params)]
+    for x, c, time in (*near, *anywhere):
+        yield x, params.force_limit * rng.uniform(-1, 1, params.action_size), np.asarray(task.at(c, time))
 
 
-def _rounded(values: Any) -> list[str]:
-    return [f"{value:.{_DIGITS}g}" for value in np.ravel(np.asarray(values, np.float64)).tolist()]
+def _anywhere(rng: np.random.Generator, params: BallbotParams) -> Iterator[tuple[np.ndarray, float]]:
+    """States with components of both signs, near zero and far from it, each with a time, s."""
+    for scale, time in itertools.product(_SCALES, _TIMES):
+        yield rng.uniform(-scale, scale, params.state_size), time
+
+
+def _with_default_fields(task: Task) -> Task:
+    """A task of the same kind with default fields."""
+    try:
+        return type(task)()
+    except TypeError:  # a field of a user's task has no default
+        return task
+
+
+def _rounded(method: Callable[..., Any], *where: np.ndarray) -> list[str]:
+    """What a method of a task gives there, as text; or the error by which it refuses a state that no episode reaches."""
+    try:
+        return _digits(method(*where))
+    except Exception as error:  # of a user's code
+        return [type(error).__name__]
+
+
+def _digits(values: Any) -> list[str]:
+    """Numbers as text. Negative zeros, which rounding makes of different signs on other machines, are zeros."""
+    return [f"{value + 0.0:.{_DIGITS}g}" for value in np.ravel(np.asarray(values, np.float64)).tolist()]

@@ -1,7 +1,7 @@
 """C code compiled to shared libraries, once per content and processor, kept in the user's cache folder.
 
 Sometimes that is impossible: there is no C compiler, the compiler fails or hangs, there is no home directory, or the folder
-cannot be written or is not the user's own.
+cannot be written or is not the user's own. Wheels of some systems contain libraries that were compiled before, in `SHIPPED`.
 """
 
 import hashlib
@@ -11,16 +11,32 @@ import platform
 import shutil
 import stat
 import subprocess
+import sys
 import tempfile
 from functools import cache
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
-_FLAGS = ("-march=native", "-fPIC", "-shared")
-_DIGEST = 32  # bytes of SHA-256 at a library's end
+_WINDOWS = sys.platform == "win32"
+SUFFIX = ".dll" if _WINDOWS else ".so"
+_FLAGS = ("-shared",) if _WINDOWS else ("-fPIC", "-shared")
+_NATIVE = "-march=native"  # some compilers do not know it for some processors, such as clang for ARM
+_LIBRARIES = () if _WINDOWS else ("-lm",)
+_DIGITS = 24  # of SHA-256, in the names of libraries
 _COMPILE_SECONDS = 120.0  # after which a compiler counts as hanging
 _VERSION_SECONDS = 10.0
 _WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+SHIPPED = Path(__file__).with_name("compiled")
+"""The libraries that a wheel contains, in a folder for each of `LEVELS`."""
+
+LEVELS = {
+    "x86-64-v3": ("avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"),
+    "x86-64": (),
+    "arm64": (),
+}
+"""Kinds of processors, the fastest first, and the features by which Linux says that a processor is of that kind."""
+
 _hanging: set[str] = set()  # compilers that were given up, so that the next libraries do not wait for them again
 
 
@@ -40,17 +56,16 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
         NoMachineCodeError: it cannot be compiled.
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
+    if (shipped := _shipped(name, source, flags)) is not None:
+        return shipped
     program = compiler()
     if program is None or program in _hanging:
         raise NoMachineCodeError
     try:
         folder = cache_folder()
         _make_private(folder)
-        key = hashlib.sha256("\0".join([source, _machine(program), *flags, *_FLAGS]).encode()).hexdigest()[:24]
-        path = folder / f"{name}-{key}.so"
-        if not _is_whole(path):
-            _build(program, source, path, flags)
-        return path
+        key = content_key(source, flags, _machine(program), _NATIVE, *_FLAGS)
+        return _whole(folder, f"{name}-{key}", own=True) or _build(program, source, folder, f"{name}-{key}", flags)
     except subprocess.CalledProcessError as error:
         raise NoMachineCodeError(f"{program} failed: {error.stderr.strip()[-300:]}") from error
     except subprocess.TimeoutExpired as error:
@@ -61,6 +76,11 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
     except (OSError, RuntimeError) as error:
         # a program that cannot be run, no home, or a folder that cannot be written
         raise NoMachineCodeError(str(error)[-300:]) from error
+
+
+def content_key(source: str, flags: tuple[str, ...], *machine: str) -> str:
+    """Digits that tell C code and the flags of its compilation, for a machine, from all others."""
+    return hashlib.sha256("\0".join([source, *machine, *flags]).encode()).hexdigest()[:_DIGITS]
 
 
 def cache_folder() -> Path:
@@ -109,17 +129,48 @@ def check_private(path: Path, variable: str) -> None:
         raise PermissionError(f'others may write into {path}; run "chmod go-w" on it')
 
 
-def _build(compiler: str, source: str, path: Path, flags: tuple[str, ...]) -> None:
+def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str, ...]) -> Path:
     """Compiles into a folder of its own, then renames: two processes at once, or a kill, never leave half a library."""
     # inside the cache, because a rename is atomic within one file system only
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
-        code, built = Path(folder) / "code.c", Path(folder) / "code.so"
-        code.write_text(source, encoding="utf-8")
-        _run([compiler, *flags, *_FLAGS, str(code), "-o", str(built), "-lm"], _COMPILE_SECONDS, check=True)
-        content = built.read_bytes()
-        # Loaders ignore what follows a library, so its digest can travel with it.
-        built.write_bytes(content + hashlib.sha256(content).digest())
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
+        built = Path(scratch) / f"code{SUFFIX}"
+        try:
+            compile_library(compiler, source, built, (*flags, _NATIVE))
+        except subprocess.CalledProcessError:
+            compile_library(compiler, source, built, flags)
+        return kept(built, folder, stem)
+
+
+def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, ...]) -> None:
+    """Compiles C code to the shared library `built`; the code lies beside it.
+
+    Raises:
+        subprocess.CalledProcessError: the compiler refuses the code or a flag.
+        subprocess.TimeoutExpired: it hangs.
+    """
+    code = built.with_suffix(".c")
+    code.write_text(source, encoding="utf-8")
+    own = flags if is_gcc(compiler) else without_parameters(flags)
+    _run([compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES], _COMPILE_SECONDS, check=True)
+
+
+def without_parameters(flags: tuple[str, ...]) -> tuple[str, ...]:
+    """Flags without GCC's `--param NAME=VALUE`, which other compilers refuse."""
+    return tuple(flag for before, flag in zip(("", *flags), flags, strict=False) if "--param" not in (before, flag))
+
+
+def kept(built: Path, folder: Path, stem: str) -> Path:
+    """Renames a library into a folder. Its name ends with a digest of its content, so that damage is noticed.
+
+    A digest inside of the file would break its signature, which macOS asks for.
+    """
+    path = folder / f"{stem}-{_digest(built)}{SUFFIX}"
+    try:
         built.replace(path)
+    except PermissionError:  # Windows replaces no library that is in use
+        if not _has_its_digest(path):
+            raise
+    return path
 
 
 def _run(command: list[str], seconds: float, check: bool) -> str:
@@ -129,19 +180,49 @@ def _run(command: list[str], seconds: float, check: bool) -> str:
     ).stdout
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether the library is there, this user's own, and as it was built: loading a damaged one would kill the process.
+def _shipped(name: str, source: str, flags: tuple[str, ...]) -> Path | None:
+    """The library that the package contains of this code, of the best level of this processor; None where there is none."""
+    if not SHIPPED.is_dir():
+        return None
+    stem = f"{name}-{content_key(source, flags)}"
+    found = (_whole(SHIPPED / level, stem, own=False) for level in _levels())
+    return next((path for path in found if path is not None), None)
 
-    A folder that others could once write into may still hold their files. These are built again.
+
+def shipped_source(name: str) -> str | None:
+    """C code that the package contains by name, for machines without CasADi; None where there is none."""
+    path = SHIPPED / "source" / f"{name}.c"
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+def _whole(folder: Path, stem: str, own: bool) -> Path | None:
+    """The library of that name that is as it was built; None where there is none. A damaged one would kill the process.
+
+    Args:
+        folder: where it is looked for.
+        stem: its name without the digest of its content.
+        own: whether it must be this user's own. A folder that others could once write into may still hold their files.
     """
+    return next((path for path in sorted(folder.glob(f"{stem}-*{SUFFIX}")) if _is_whole(path, own)), None)
+
+
+def _is_whole(path: Path, own: bool) -> bool:
     try:
         if not stat.S_ISREG(path.lstat().st_mode):
             return False
-        check_private(path, "BALLBOT_CACHE")
+        if own:
+            check_private(path, "BALLBOT_CACHE")
     except (FileNotFoundError, PermissionError):
         return False
-    content = path.read_bytes()
-    return hashlib.sha256(content[:-_DIGEST]).digest() == content[-_DIGEST:]
+    return _has_its_digest(path)
+
+
+def _has_its_digest(path: Path) -> bool:
+    return path.is_file() and path.stem.rpartition("-")[2] == _digest(path)
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS]
 
 
 @cache
@@ -154,11 +235,41 @@ def compiler() -> str | None:
 
 
 @cache
+def is_gcc(compiler: str) -> bool:
+    """Whether a compiler is GCC. On macOS, clang is called gcc too."""
+    return "Free Software Foundation" in _version(compiler)
+
+
+@cache
+def _version(compiler: str) -> str:
+    return _run([compiler, "--version"], _VERSION_SECONDS, check=False)
+
+
+@cache
 def _machine(compiler: str) -> str:
     """What a library compiled with -march=native depends on besides its source."""
-    version = _run([compiler, "--version"], _VERSION_SECONDS, check=False)
+    return f"{platform.machine()} {' '.join(_features()) or platform.processor()} {_version(compiler)}"
+
+
+@cache
+def _features() -> tuple[str, ...]:
+    """What Linux says that this processor can do; () elsewhere."""
     try:
-        cpu = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags"))
-    except (OSError, StopIteration):
-        cpu = platform.processor()
-    return f"{platform.machine()} {cpu} {version}"
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ()
+    # "flags" on x86, "Features" on ARM
+    return tuple(next((line for line in lines if line.lower().startswith(("flags", "features"))), "").split()[2:])
+
+
+@cache
+def _levels() -> tuple[str, ...]:
+    """Those of `LEVELS` that this processor is of, the fastest first."""
+    family = {"x86_64": "x86-64", "amd64": "x86-64", "aarch64": "arm64", "arm64": "arm64"}.get(
+        platform.machine().lower()
+    )
+    return tuple(
+        level
+        for level, needed in LEVELS.items()
+        if family is not None and level.startswith(family) and set(needed) <= set(_features())
+    )

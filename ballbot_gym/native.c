@@ -2,8 +2,15 @@
 
    Row i of a pointer p, one number per robot, is at p + i * sp: rows are those of a whole batch, or of a block of LANES robots. */
 
-#include <sched.h>
 #include <string.h>
+
+#ifdef _WIN32
+__declspec(dllimport) int __stdcall SwitchToThread(void);
+#define YIELD SwitchToThread
+#else
+#include <sched.h>
+#define YIELD sched_yield
+#endif
 
 /* states, constants, actions and numbers of steps taken -> next states, forces, grip, rewards and costs, flags, violated limit */
 static void advance(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict a, int64_t sa,
@@ -239,5 +246,5 @@ void step(Memory *m) {
         __atomic_fetch_add(&m->done, last - first, __ATOMIC_RELEASE);
     }
     while (__atomic_load_n(&m->done, __ATOMIC_ACQUIRE) < m->B) /* other threads finish their last chunks */
-        sched_yield();
+        YIELD();
 }

@@ -9,6 +9,7 @@ import ctypes
 import os
 from collections.abc import Sequence
 from functools import cache
+from importlib.util import find_spec
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
@@ -16,26 +17,30 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from ballbot_gym import codegen, machine_code
-from ballbot_gym.autoreset import Info, Step, info_of, step, told
-from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym import machine_code
+from ballbot_gym.autoreset import Info, Step, info_of, told
+from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
+from ballbot_gym.identity import problem_digest
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
 
-# isort: split
-import torch  # after our modules, whose errors name the extra that brings it
-
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
 """Number of envs from which threads share the work: 2,048 take as long on two as on one, and 4,096 a seventh less."""
 
 
+FLAG_ROWS = 6
+"""Rows of flags: those of `codegen.FLAGS`, and whether the episode is done."""
+
 State = Any
 """A `BatchState` whose fields are NumPy arrays."""
+
+Computed = tuple[np.ndarray, ...]
+"""What a step computes, in the order of the last fields of `_Memory`."""
 
 
 @fixed("task", "params", "randomization", "history", "num_envs", "dtype")
@@ -54,7 +59,7 @@ class BallbotNative:
         dtype: type[np.floating],
         params: BallbotParams,
         threads: int = 1,
-        code: ctypes.CDLL | None = None,
+        code: Any = None,
     ):
         """Makes the envs.
 
@@ -129,10 +134,14 @@ class BallbotNative:
             state.seed[seeded], state.episode[seeded] = seeds[seeded], 0
         if c is not None:
             state.c[:, which] = c[:, which]
-        arrays, given = _pointers(which, state.seed, state.episode), c is not None
-        self._code.ballbot_start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
+        self._start(which, state, c is not None)
         state.steps[which] = 0
         return state
+
+    def _start(self, which: np.ndarray, state: State, given: bool) -> None:
+        """Starts episodes in some envs of a state, in place; their constants are drawn unless they are given."""
+        arrays = _pointers(which, state.seed, state.episode)
+        self._code.ballbot_start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
 
     def observe(self, state: State) -> np.ndarray:
         """(B, no) observations of a state."""
@@ -148,21 +157,9 @@ class BallbotNative:
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         begins, restarts = self.restarts or waiting is not None, self.restarts
-        empty = np.empty
-        made = rows, seen, pay, flags, counts, c, last = [empty(*kind) for kind in self._kinds[restarts]]
-        given = actions
-        if any(stride % actions.itemsize for stride in actions.strides):
-            actions = actions.copy()
-        apart = (stride // actions.itemsize for stride in actions.strides)
-        if actions.flags.f_contiguous:
-            actions = actions.T  # the same memory, in the order that `_pointer` likes
-        read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
-        idle = 0 if waiting is None else _pointer(waiting)
-        written = begins, restarts, *_pointers(*made)
-        memory = _Memory(0, 0, self.num_envs, self.most_steps, 0, *apart, *read, idle, *written)
-        self._run(memory)
-        if memory.bad:  # what was written is forgotten
-            check_finite(given)
+        (rows, seen, pay, flags, counts, c, last), bad = self._computed(old, actions, waiting)
+        if bad:  # what was computed is forgotten
+            check_finite(actions)
         violated, steps, episode = counts[0], counts[1], counts[2]  # to unpack it takes three times as long
         if not begins:
             episode, c = old.episode, old.c
@@ -176,6 +173,21 @@ class BallbotNative:
             last = last.take(ended, 0)
         return told(observation, pay[0], flags[0], flags[1], now, end, last)
 
+    def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
+        """What a step from a state computes, and whether an action is not finite."""
+        made = [np.empty(*kind) for kind in self._kinds[self.restarts]]
+        if any(stride % actions.itemsize for stride in actions.strides):
+            actions = actions.copy()
+        apart = (stride // actions.itemsize for stride in actions.strides)
+        if actions.flags.f_contiguous:
+            actions = actions.T  # the same memory, in the order that `_pointer` likes
+        read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
+        idle = 0 if waiting is None else _pointer(waiting)
+        written = self.restarts or waiting is not None, self.restarts, *_pointers(*made)
+        memory = _Memory(0, 0, self.num_envs, self.most_steps, 0, *apart, *read, idle, *written)
+        self._run(memory)
+        return tuple(made), bool(memory.bad)
+
     def _written(self, restarts: bool) -> list[tuple[tuple[int, int], np.dtype]]:
         """Shapes and kinds of what a step writes, in the order of `_Memory`."""
         size, kept, kinds = self.num_envs, int(restarts), (self.dtype, np.float64, np.bool_, np.int64, np.float32)
@@ -184,7 +196,7 @@ class BallbotNative:
             ((self._told_rows * (1 + kept), size), real),
             ((self._seen_rows, size), real),
             ((5 + 4 * kept, size), double),
-            ((len(codegen.FLAGS) + 1 + 3 * kept, size), truth),
+            ((FLAG_ROWS + 3 * kept, size), truth),
             ((3, size), whole),
             ((len(self.task.constant_names), size), real),
             ((size * kept, self._seen_rows), single),
@@ -246,23 +258,50 @@ def _check(code: ctypes.CDLL, task: Task, params: BallbotParams, double: bool) -
 
     A symbol that is made a float, for one, becomes NaN without a word.
     """
+    from ballbot_gym.array_batch import BallbotArrays  # a subclass of this module's class
+
     dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
     actions = np.asfortranarray(np.array(actions, dtype)[:, : params.action_size])
-    own = BallbotNative(task, len(actions), dtype, params, code=code)
-    kind = torch.float64 if double else torch.float32
-    batch = BallbotBatch(task, len(actions), dtype=kind, compile=False, params=params)
-    own.state = first = own.initial_state(seed=0)
-    batch.state = start = batch.initial_state(seed=0)
-    found = {"first observation": own.observe(first), "start": first.x, "constants": first.c}
-    expected = {"first observation": batch.observe(start), "start": start.x, "constants": start.c}
-    for values, done in ((found, own.step(actions)), (expected, step(batch, actions, None))):
-        *returned, infos = done
+    told = []
+    batch = (
+        BallbotNative(task, len(actions), dtype, params, code=code),
+        BallbotArrays(task, len(actions), dtype, params),
+    )
+    for envs in batch:
+        envs.state = start = envs.initial_state(seed=0)
+        values = {"first observation": envs.observe(start), "start": start.x, "constants": start.c}
+        *returned, infos = envs.step(actions)
         ends = {f"final {name}": part for name, part in infos.pop("final_info", {}).items()}
-        values |= dict(zip(("observation", "reward", "terminated", "truncated"), returned, strict=True)) | infos | ends
+        told.append(
+            values
+            | dict(zip(("observation", "reward", "terminated", "truncated"), returned, strict=True))
+            | infos
+            | ends
+        )
+    found, expected = told
     for name in expected:
         if not np.allclose(found.get(name, np.nan), expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
+
+
+def _source(task: Task, params: BallbotParams, double: bool) -> str:
+    """The C code of a task and a robot: `codegen`'s, or where CasADi is missing what a wheel has of it.
+
+    Raises:
+        ImportError: CasADi is missing, and no wheel has the code.
+        Exception: as `codegen.source`.
+    """
+    if find_spec("casadi") is None and (written := machine_code.shipped_source(code_name(task, params, double))):
+        return written
+    from ballbot_gym import codegen  # it imports CasADi
+
+    return codegen.source(task, params, double)
+
+
+def code_name(task: Task, params: BallbotParams, double: bool) -> str:
+    """What the code of a task and a robot is called where wheels keep it."""
+    return f"{type(task).__name__.lower()}-{problem_digest(task, params)}-{'double' if double else 'float'}"
 
 
 @cache
@@ -273,7 +312,9 @@ def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
         NoMachineCodeError: see `BallbotNative`.
     """
     try:
-        source = codegen.source(task, params, double)
+        source = _source(task, params, double)
+    except (ImportError, NoMachineCodeError):
+        raise
     except Exception as error:  # whatever code of users raises that meets CasADi's symbols
         raise NoMachineCodeError(f"{task.id} cannot be traced: {type(error).__name__}: {error}") from error
     try:

@@ -118,15 +118,33 @@ def robot_setting(robot: str) -> dict[str, str]:
 def robot_name(params: BallbotParams) -> str:
     """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
 
-    With another friction it is the same robot. Any other is taken for the paper's, or for "rolling" if its ball rolls, or for
-    "omni" if it has wheels.
+    With another friction it is the same robot, unless that has a name of its own. Any other is taken for the paper's, or for
+    "rolling" if its ball rolls, or for "omni" if it has wheels. `registered_name` is for records, which must not mistake one.
     """
+    by_numbers = {robot.params: name for name, robot in reversed(ROBOTS.items())}
+    if params in by_numbers:
+        return by_numbers[params]
     for name in ROBOTS:
         if replace(named_robot(name), friction=params.friction) == params:
             return name
     if params.wheels is not None:
         return "omni"
     return "rolling" if params.rolls else PAPER
+
+
+def registered_name(params: BallbotParams) -> str:
+    """The name in `ROBOTS` of exactly this robot.
+
+    Raises:
+        ValueError: it has none.
+    """
+    name = robot_name(params)
+    if ROBOTS[name].params != params:
+        raise ValueError(
+            f"this robot has no name: its numbers are not those of {name!r}. Give it one with ballbot_gym.register_robot, "
+            "because policies and records of a training name their robot"
+        )
+    return name
 
 
 def checked_robot(robot: Any, params: Any = None) -> BallbotParams:

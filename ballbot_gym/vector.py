@@ -1,7 +1,11 @@
-"""BallbotVectorEnv: Gymnasium's vector interface to machine code, or to a `BallbotBatch` in torch."""
+"""BallbotVectorEnv: Gymnasium's vector interface to machine code, to a `BallbotBatch` in torch, or to NumPy."""
+
+from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -10,35 +14,36 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from ballbot_gym.array_batch import BallbotArrays
+from ballbot_gym.autoreset import as_array, filled, info_of, masked, step
+from ballbot_gym.batch_state import BatchState, check_starts
 from ballbot_gym.checks import (
     check_constant_names,
     check_finite,
+    check_history,
     finite_array,
     fixed,
     real_array,
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Robot
+from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task
-from ballbot_gym.lazy import imports_of
+from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
+from ballbot_gym.native import BallbotNative
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import picture
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
-from ballbot_gym.sensors import observation_space
+from ballbot_gym.sensors import check_observation, observation_space
 from ballbot_gym.tasks import Task
 
-with imports_of('make_vec without vectorization_mode="sync" and physics="rk4"', "train"):
+if TYPE_CHECKING:
     import torch
 
-    from ballbot_gym.autoreset import as_array, filled, info_of, masked, step
-    from ballbot_gym.batch import BallbotBatch, BatchState, check_starts, dtype_named, tilt_of
+    from ballbot_gym.batch import BallbotBatch
 
-if TYPE_CHECKING:
-    from ballbot_gym.native import BallbotNative
-
-_ENGINES = ("auto", "native", "torch")
+_ENGINES = ("auto", "native", "torch", "numpy")
 
 _log = logging.getLogger(__name__)
 
@@ -73,7 +78,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         task: str | Task = "stabilize",
         render_mode: str | None = None,
         device: str | torch.device = "cpu",
-        dtype: torch.dtype | str = torch.float32,
+        dtype: torch.dtype | str = "float32",
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
         randomization: Randomization | str | None = None,
@@ -96,9 +101,11 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
                 once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`, no history and no
-                sensors. "torch" computes them in torch, and `compile` says whether that is compiled. "auto" takes "native"
-                where it can on a CPU, unless compile is True or False; else "torch". Both run the same episodes, to
-                rounding. `batch` is a `BallbotNative` or a `BallbotBatch`.
+                sensors. Wheels of some systems have that code of the shipped tasks and robots, and then it needs neither
+                compiler nor CasADi. "torch" computes them in torch, and `compile` says whether that is compiled. "numpy"
+                needs nothing else, knows what "native" knows, and is the slowest. "auto" takes "native" where it can on a
+                CPU, unless compile is True or False; else "torch", or where that is not installed "numpy". All run the
+                same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotArrays`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -117,21 +124,12 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics=...), or "async"'
             )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        if engine == "native" and torch.device(device).type != "cpu":
-            raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
-        real: torch.dtype = dtype_named(dtype)
-        self._dtype = np.float32 if real == torch.float32 else np.float64
-
-        def batch(compile: bool | str) -> BallbotBatch:
-            return BallbotBatch(
-                task, num_envs, device, real, compile, params, randomization, history=history, observation=observation
-            )
-
-        native, cpu = None, torch.device(device).type == "cpu"
-        if engine == "native" or (engine == "auto" and cpu and compile == "auto"):
-            # the batch is made in any case, because it checks the arguments; it allocates nothing
-            native = _native(batch(compile=False), self._dtype, must=engine == "native")
-        self.batch: BallbotBatch | BallbotNative = native or batch(compile)
+        build: Any = _in_torch if find_spec("torch") is not None else _without_torch
+        given = {"randomization": randomization, "history": history, "observation": observation}
+        batch = build(engine, task, num_envs, device, dtype, compile, params, **given)
+        self.batch: BallbotBatch | BallbotNative = batch
+        self._native: BallbotNative | None = batch if isinstance(batch, BallbotNative) else None
+        self._dtype = self._native.dtype if self._native else np.dtype(str(batch.dtype).rpartition(".")[2]).type
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.history, self.observation = self.batch.history, self.batch.observation
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
@@ -167,16 +165,14 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         if self.batch.state is None:
             mask = np.ones_like(mask)
         batch_mask: Any = self._to_batch(mask)
-        with torch.no_grad():
-            state = self.batch.initial_state(seed, batch_mask)
-            if constants is not None:
-                c: Any = self._constants(constants, state, mask)
-                state = self.batch.initial_state(seed, batch_mask, c=c)
-            if x is not None:
-                state = self._with_x(state, x, mask)
-            self.batch.state = state
-            observation = self.batch.observe(state)
-            tilt: Any = tilt_of(state.x.unbind(0)) if isinstance(self.batch, BallbotBatch) else self.batch.tilt(state)
+        state = self.batch.initial_state(seed, batch_mask)
+        if constants is not None:
+            c: Any = self._constants(constants, state, mask)
+            state = self.batch.initial_state(seed, batch_mask, c=c)
+        if x is not None:
+            state = self._with_x(state, x, mask)
+        self.batch.state = state
+        observation, tilt = as_array(self.batch.observe(state)), as_array(self.batch.tilt(state))
         self._ended = self._ended & ~mask
         force, grip = (
             np.zeros((rows, self.num_envs), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips)
@@ -184,8 +180,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         cost, parts = np.zeros(self.num_envs), np.zeros((3, self.num_envs))
         success, failure, clipped = np.zeros((3, self.num_envs), bool)
         none = filled(-1, self.num_envs)
-        info = info_of(state, as_array(tilt), none, cost, parts, force, success, failure, clipped, grip)
-        return as_array(observation).astype(np.float32, copy=False), masked(info, mask)
+        info = info_of(state, tilt, none, cost, parts, force, success, failure, clipped, grip)
+        return observation.astype(np.float32, copy=False), masked(info, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -211,8 +207,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 f"the episodes of envs {np.flatnonzero(waiting)[:8].tolist()} have ended; reset them with "
                 'options={"reset_mask": mask}'
             )
-        batch = self.batch
-        result = step(batch, actions, waiting) if isinstance(batch, BallbotBatch) else batch.step(actions, waiting)
+        batch: Any = self.batch
+        result = self._native.step(actions, waiting) if self._native else step(batch, actions, waiting)
         if not batch.restarts:
             self._ended = result[2] | result[3]
         return result
@@ -267,7 +263,12 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
 
     def _to_batch(self, array: np.ndarray) -> Any:
         """The array as the batch takes it."""
-        return torch.from_numpy(array).to(self.batch.device) if isinstance(self.batch, BallbotBatch) else array
+        if self._native:
+            return array
+        import torch
+
+        batch: Any = self.batch
+        return torch.from_numpy(array).to(batch.device)
 
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
         """(nc, B) constants: those given, and drawn ones for the rest."""
@@ -292,18 +293,96 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         return state._replace(x=self._to_batch(x))
 
 
-def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
-    """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
-    if batch.randomization != Randomization() or batch.history or batch.observation != "state":
-        if must:
-            raise ValueError('engine="native" knows no Randomization, no history and no sensors; take engine="torch"')
-        return None
-    try:
-        from ballbot_gym.native import BallbotNative
+def _in_torch(
+    engine: str,
+    task: Task,
+    num_envs: int,
+    device: str | torch.device,
+    dtype: torch.dtype | str,
+    compile: bool | str,
+    params: BallbotParams,
+    **settings: Any,
+) -> BallbotBatch | BallbotNative:
+    """What computes the envs where torch is installed; arguments as of `BallbotVectorEnv`."""
+    import torch
 
-        return BallbotNative(batch.task, batch.num_envs, dtype, batch.params, torch.get_num_threads())
+    from ballbot_gym.batch import BallbotBatch
+
+    cpu = torch.device(device).type == "cpu"
+    if engine in ("native", "numpy") and not cpu:
+        raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
+    wanted = engine in ("native", "numpy") or (engine == "auto" and cpu and compile == "auto")
+    # the batch is made in any case, because it checks the arguments; it allocates nothing
+    batch = BallbotBatch(task, num_envs, device, dtype, False if wanted else compile, params, **settings)
+    if wanted:
+        real = np.float32 if batch.dtype == torch.float32 else np.float64
+        plain = batch.randomization == Randomization() and not batch.history and batch.observation == "state"
+        if found := _without_gradients(
+            engine, batch.task, num_envs, real, batch.params, plain, torch.get_num_threads()
+        ):
+            return found
+    return BallbotBatch(task, num_envs, device, dtype, compile, params, **settings)
+
+
+def _without_torch(
+    engine: str,
+    task: Task,
+    num_envs: int,
+    device: str,
+    dtype: str,
+    compile: bool | str,
+    params: BallbotParams,
+    randomization: Randomization | str | None,
+    history: int,
+    observation: str,
+) -> BallbotNative:
+    """What computes the envs where torch is missing; arguments as of `BallbotVectorEnv`.
+
+    Raises:
+        ModuleNotFoundError: an argument asks for what torch alone computes.
+        ValueError: as `BallbotVectorEnv`.
+    """
+    varied = checked_randomization(randomization, params)
+    plain = (
+        varied == Randomization()
+        and not check_history(history)
+        and check_observation(observation, params, varied) == "state"
+    )
+    if engine == "torch" or device != "cpu" or compile != "auto" or (engine == "auto" and not plain):
+        raise missing('engine="torch", another device, compile, or what varies or is remembered', "torch", "train")
+    if dtype not in ("float32", "float64"):
+        raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
+    real = np.float32 if dtype == "float32" else np.float64
+    found = _without_gradients(engine, task, num_envs, real, params, plain, os.cpu_count() or 1)
+    return found or BallbotArrays(task, num_envs, real, params)
+
+
+def _without_gradients(
+    engine: str,
+    task: Task,
+    num_envs: int,
+    dtype: type[np.floating],
+    params: BallbotParams,
+    plain: bool,
+    threads: int,
+) -> BallbotNative | None:
+    """The envs in machine code or in NumPy. Where that is not possible: None, or an error if the engine must be that.
+
+    Args:
+        plain: whether nothing varies and no sensors or past observations are shown.
+    """
+    if not plain:
+        if engine != "auto":
+            raise ValueError(
+                f'engine="{engine}" knows no Randomization, no history and no sensors; take engine="torch"'
+            )
+        return None
+    if engine == "numpy":
+        return BallbotArrays(task, num_envs, dtype, params)
+    try:
+        return BallbotNative(task, num_envs, dtype, params, threads)
     except (ImportError, NoMachineCodeError) as error:
-        if must:
+        if engine == "native":
             raise
         _log.warning("no machine code, so the envs are slower: %s", error)
         return None

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_baselines.batched import find_optima
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optima, find_optimum
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
@@ -60,7 +59,8 @@ def measured(name: str, episodes: int, seed: int) -> Row:
                 print(f"{name}, episode {i}: {error}")
         seconds[0] += time.process_time() - begin
         begin = time.process_time()
-        costs[rows] = find_optima(task, params, x0[rows], c[rows]).costs
+        optima = find_optima(task, params, x0[rows], c[rows])
+        costs[rows] = [math.nan if optimum is None else optimum.cost for optimum in optima]
         seconds[1] += time.process_time() - begin
     excess = (costs / alone - 1)[np.isfinite(costs) & np.isfinite(alone)]
     return Row(

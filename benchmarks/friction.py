@@ -69,7 +69,7 @@ def demand(out: Path) -> None:
 
 def sweep(out: Path) -> None:
     """Cost and lean of the rolling robot's optima against friction."""
-    from ballbot_baselines.optimum import find_optimum
+    from ballbot_baselines import find_optimum
 
     rolling, rows = named_robot("rolling"), []
     free = dataclasses.replace(rolling, friction=math.inf)
@@ -122,7 +122,7 @@ class _Floor(BallbotEnv):
 
 def contact(out: Path, episodes: int) -> None:
     """What the simulated floor gives the rolling robot under tracked plans."""
-    from ballbot_baselines.trajopt import TrajoptController
+    from ballbot_baselines import TrajoptController
 
     robot, rows = named_robot("rolling"), []
     for name in TASKS:
@@ -155,7 +155,7 @@ def contact(out: Path, episodes: int) -> None:
 
 def never_slip(out: Path, episodes: int) -> None:
     """What it costs to slip on no floor of "unknown": each robot's optimum on the slipperiest, over that on its own."""
-    from ballbot_baselines.optimum import find_optimum
+    from ballbot_baselines import find_optimum
 
     nominal, track, rows = named_robot("rolling"), TRACKS["unknown"], []
     for name in TASKS:

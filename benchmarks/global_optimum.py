@@ -22,8 +22,8 @@ import numpy as np
 import tyro
 from scipy.ndimage import map_coordinates
 
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics, files
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS

@@ -13,8 +13,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import NmpcController, find_optimum
 from ballbot_gym import files
 from ballbot_gym.certified.cache import episode
 from ballbot_gym.env import BallbotEnv

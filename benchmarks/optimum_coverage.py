@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
+from ballbot_baselines import Optimum, find_optimum
+from ballbot_baselines.optimum.guesses import ALL_GUESSES
 from ballbot_gym import files
 from ballbot_gym.params import default_params
 from ballbot_gym.paths import sides_passed

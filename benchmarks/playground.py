@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from ballbot_gym import files
-from ballbot_gym.viewer import Viewer
+from ballbot_gym.drawing.viewer import Viewer
 from ballbot_train.report.live_page import PATIENCE, PlayPage
 from ballbot_train.report.simulation import Playground
 
@@ -31,13 +31,9 @@ _WARM_UP = 60.0  # s, after which memory is looked at first
 
 
 class TimedPage(PlayPage):
-    """A page that keeps how late each step began, s. `watch` does not say where its camera is, so viser does not count it."""
+    """A page that notes how late each step began, s."""
 
     late = array("d")
-
-    @property
-    def watched(self) -> bool:
-        return True
 
     def next_due(self, now: float, due: float) -> float:
         self.late.append(now - due)
@@ -51,10 +47,9 @@ def memory() -> float:
 
 def watch(port: int) -> None:
     """Receives what a browser would, in a process of its own."""
-    import viser
     from websockets.sync.client import connect
 
-    with connect(f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as client:
+    with connect(f"ws://127.0.0.1:{port}/stream", max_size=None) as client:
         while True:
             client.recv()
 
@@ -79,9 +74,11 @@ def measure(
     """
     playground, viewer = Playground(task, controller, ghosts, physics), Viewer(port=0)
     page = TimedPage(playground, viewer)
-    watcher = multiprocessing.get_context("spawn").Process(target=watch, args=(viewer.server.get_port(),), daemon=True)
+    watcher = multiprocessing.get_context("spawn").Process(target=watch, args=(viewer.port,), daemon=True)
     watcher.start()
-    page.run(_PUSH_EVERY)  # the watcher has come
+    while not viewer.is_watched:
+        time.sleep(0.1)
+    page.run(_PUSH_EVERY)
     del page.late[:]
     began, cpu, before = time.perf_counter(), time.process_time(), math.nan
     for k in range(math.ceil(60 * minutes / _PUSH_EVERY)):

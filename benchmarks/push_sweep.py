@@ -12,9 +12,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import LqrController, NmpcController, TrajoptController
 from ballbot_gym import files
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import Controller, PlanError, simulate

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import tyro
 
-from ballbot_baselines.nmpc import NmpcController
+from ballbot_baselines import NmpcController
 from ballbot_gym import certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv, make_task

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_baselines import sides
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum import sides
 from ballbot_gym import files
 from ballbot_gym.params import default_params
 from ballbot_gym.paths import sides_passed

@@ -20,12 +20,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import SnoptSolver
 
-from ballbot_baselines.collocation import Guess, Problem, hermite_simpson, solve
-from ballbot_baselines.ocp import OcpSolver
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS
+from ballbot_baselines.paper.collocation import Problem, hermite_simpson, solve
+from ballbot_baselines.paper.problems import PAPER_PROBLEMS
+from ballbot_baselines.solvers.ocp import OcpSolver
 from ballbot_gym import files
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
 from ballbot_gym.rollout import PlanError
+from ballbot_gym.trajectory import Trajectory
 
 PROBLEMS = ("stabilize-1", "stabilize-5", "turn-3", "turn-10")
 _EQUAL = 1e-3  # relative difference of optima that counts as none
@@ -58,7 +59,7 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
         entry = PAPER_PROBLEMS[name]
         problem, smooth = entry.problem, entry.guess(params)
         line = np.linspace(problem.initial[0], problem.final[0], problem.intervals + 1)
-        straight = Guess(line, np.zeros((len(line), 2)), smooth.h)
+        straight = Trajectory(smooth.t, line, np.zeros((len(line), 2)))
         for label, program, timing in (
             ("straight line", "Drake + SNOPT", time_drake(problem, params, straight, repeats)),
             ("cubic Hermite", "Drake + SNOPT", time_drake(problem, params, smooth, repeats)),
@@ -78,7 +79,7 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
     print(f"written to {out}")
 
 
-def time_ours(problem: Problem, params: BallbotParams, guess: Guess, repeats: int) -> tuple[float, ...]:
+def time_ours(problem: Problem, params: BallbotParams, guess: Trajectory, repeats: int) -> tuple[float, ...]:
     """Cost, and seconds to build, to solve from the guess, and to solve again from the solution."""
     start = time.perf_counter()
     OcpSolver(hermite_simpson(problem, params), problem.intervals, "fatrop")
@@ -87,13 +88,11 @@ def time_ours(problem: Problem, params: BallbotParams, guess: Guess, repeats: in
         plans = [solve(problem, params, guess, "fatrop") for _ in range(repeats)]
     except PlanError:
         return np.nan, built, np.nan, np.nan
-    found = plans[0].trajectory
-    again = Guess(found.x, found.u, float(found.t[1]), tuple(plans[0].q))
-    warm = [solve(problem, params, again, "fatrop").seconds for _ in range(repeats)]
+    warm = [solve(problem, params, plans[0].trajectory, "fatrop").seconds for _ in range(repeats)]
     return plans[0].cost, built, float(np.median([plan.seconds for plan in plans])), float(np.median(warm))
 
 
-def time_drake(problem: Problem, params: BallbotParams, guess: Guess, repeats: int) -> tuple[float, ...]:
+def time_drake(problem: Problem, params: BallbotParams, guess: Trajectory, repeats: int) -> tuple[float, ...]:
     """The same of Drake's DirectCollocation with SNOPT."""
     start = time.perf_counter()
     collocation = drake_collocation(problem, params)
@@ -174,13 +173,13 @@ def ratios(rows: list[Timing]) -> list[str]:
     return [*lines, f"geometric means: {straight:.0f} from the straight line, {cubic:.0f} from the cubic Hermite"]
 
 
-def _set_guess(collocation: DirectCollocation, guess: Guess) -> None:
+def _set_guess(collocation: DirectCollocation, guess: Trajectory) -> None:
     program = collocation.prog()
     for k in range(len(guess.x)):
         program.SetInitialGuess(collocation.state(k), guess.x[k])
         program.SetInitialGuess(collocation.input(k), guess.u[k])
         if k < len(guess.x) - 1:
-            program.SetInitialGuess(collocation.time_step(k)[0], guess.h)
+            program.SetInitialGuess(collocation.time_step(k)[0], guess.t[1])
 
 
 def _median_seconds(run: Callable, repeats: int) -> tuple:

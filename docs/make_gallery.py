@@ -20,9 +20,9 @@ from PIL import Image
 from ballbot_baselines import CONTROLLERS, find_optimum
 from ballbot_gym import certified, files
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym.drawing.picture import picture
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
-from ballbot_gym.picture import picture
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS

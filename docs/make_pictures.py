@@ -52,11 +52,11 @@ MAKES = [
     Make(
         "replay stabilize --episode 1 --controllers trajopt --robot rolling --frictions 0.8 0.6 0.5 --seconds 3 --speed 0.75 "
         "--fps 20 --format webp",
-        {"slip.webp": "stabilize-rolling-trajopt-1-on-0.8-0.6-0.5.webp"},
+        {"slip.webp": "stabilize-rolling-trajopt-1+0.8+0.6+0.5.webp"},
     ),
     Make(
         "replay stabilize --controllers lqr nmpc sac --episode 7 --seconds 3 --speed 0.75 --width 800 --format webp",
-        {"lean.webp": "stabilize-lqr-nmpc-sac-7.webp"},
+        {"lean.webp": "stabilize-lqr+nmpc+sac-7.webp"},
         ("stabilize",),
         ("lqr", "nmpc", "sac"),
     ),

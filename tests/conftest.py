@@ -69,8 +69,8 @@ def interpreted(monkeypatch):
 
     For a problem that no other test solves, compiling takes longer than solving without machine code.
     """
-    compiled, shooting = (pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "shooting"))
-    monkeypatch.setattr(compiled, "loaded", lambda *_: None)
+    compiled, shooting = (pytest.importorskip(f"ballbot_baselines.solvers.{name}") for name in ("compiled", "shooting"))
+    monkeypatch.setattr(compiled, "_loaded", lambda *_: None)
     for name in ("ocp_of", "_solver"):
         monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))
 

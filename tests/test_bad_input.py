@@ -20,7 +20,7 @@ import safetensors.torch
 import torch
 from builders import result
 
-from ballbot_baselines.optimum import Backoff
+from ballbot_baselines import Backoff
 from ballbot_gym import BallbotEnv, certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task

@@ -6,8 +6,8 @@ import pytest
 from builders import FunctionController
 from builders import result as certified_result
 
-from ballbot_baselines.optimum import find_optimum
-from ballbot_baselines.recovery import largest_leans
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum.recovery import largest_leans
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.rollout import rollout
@@ -116,7 +116,9 @@ def test_maps_are_written_and_drawn(bounds, tmp_path):
 
 
 def test_the_command_maps_what_is_recoverable(tmp_path, typed, monkeypatch):
-    monkeypatch.setattr("ballbot_baselines.recovery.largest_leans", lambda *problem: np.full(31, math.radians(40)))
+    monkeypatch.setattr(
+        "ballbot_baselines.optimum.recovery.largest_leans", lambda *problem: np.full(31, math.radians(40))
+    )
     ended, printed = typed("basins", "--controllers", "lqr", "--points", 3, "--physics", "rk4", "--workers", 1)
     assert (ended, "Share of the recoverable states, 3 × 3 a map" in printed) == (0, True), printed
     assert {path.name for path in (tmp_path / "runs" / "basins").iterdir()} == {

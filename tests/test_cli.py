@@ -173,7 +173,7 @@ def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, me
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     packaged = certified.path_of(make_task("turn")).read_bytes()
-    certification = importlib.import_module("ballbot_baselines.certification")
+    certification = importlib.import_module("ballbot_baselines.optimum.certification")
     solved, again = [], []
     find_optimum = certification.find_optimum
 

@@ -5,11 +5,7 @@ import pytest
 import torch
 from test_examples import load
 
-from ballbot_baselines import find_optimum, regret
-from ballbot_baselines.batched import solves
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optima, find_optimum, regret
 from ballbot_gym import BallbotEnv, step_code
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.native import BallbotNative
@@ -129,8 +125,10 @@ def test_an_optimum_may_start_later_in_the_episode(task, params):
     assert late.cost == pytest.approx(task.control_dt * np.sum(rates), rel=1e-9)
 
 
-def test_batches_of_optima_leave_a_task_with_a_clock_to_find_optimum(task, params):
-    assert not solves(task, params)
+def test_optima_of_a_task_with_a_clock_are_found_one_by_one(task, params):
+    x, c = task.sample(np.random.default_rng(0), params)
+    (optimum,) = find_optima(task, params, x[None], c[None])
+    assert optimum.cost == find_optimum(task, params, x, c).cost
 
 
 def test_apg_pays_what_the_episodes_cost_and_dagger_says_that_it_cannot(task, params):

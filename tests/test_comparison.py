@@ -6,7 +6,7 @@ import pytest
 from builders import result
 
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.statistics import interval, verdict
+from ballbot_train.evaluation.statistics import interval, share_interval, verdict
 
 EXPERT, POLICY = "lqr", "shac"
 
@@ -42,6 +42,18 @@ def test_the_interval_covers_the_true_mean_as_often_as_it_says(rng):
         low, high = interval(rng.exponential(size=50))
         covered += low <= 1.0 <= high
     assert covered >= 86  # 95 % less three standard deviations, and what skewed data cost
+
+
+@pytest.mark.parametrize("draw", ["exponential", "normal", "random"])
+def test_the_intervals_are_those_of_scipy(rng, draw):
+    stats = pytest.importorskip("scipy.stats")
+    values = getattr(rng, draw)(size=60)
+    options = {"confidence_level": 0.95, "n_resamples": 9999, "method": "BCa", "rng": np.random.default_rng(0)}
+    expected = stats.bootstrap((values,), np.mean, **options).confidence_interval
+    assert interval(values) == pytest.approx((expected.low, expected.high), rel=1e-12)
+    for count, total in ((0, 10), (3, 10), (10, 10), (9987, 10000)):
+        wilson = stats.binomtest(count, total).proportion_ci(0.95, method="wilson")
+        assert share_interval(count, total) == pytest.approx((wilson.low, wilson.high), rel=1e-12)
 
 
 def test_the_interval_of_degenerate_data_exists_or_is_nan_without_a_warning(recwarn):

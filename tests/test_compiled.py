@@ -11,7 +11,7 @@ pytest.importorskip("casadi")
 import casadi
 import numpy as np
 
-from ballbot_baselines import compiled
+from ballbot_baselines.solvers import compiled
 from ballbot_gym import machine_code
 
 needs_compiler = pytest.mark.skipif(machine_code.compiler() is None, reason="no C compiler")

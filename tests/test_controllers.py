@@ -5,9 +5,8 @@ pytest.importorskip("casadi")
 
 from builders import FunctionController
 
-from ballbot_baselines import LqrController, TrajoptController, TvlqrController
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import LqrController, TrajoptController, TvlqrController, find_optimum
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize

@@ -12,8 +12,8 @@ import minari
 import numpy as np
 import pytest
 
-from ballbot_baselines import trajopt
-from ballbot_baselines.trajopt import EXECUTED
+from ballbot_baselines.feedback import trajopt
+from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main

@@ -36,7 +36,7 @@ def episode(motion):
 
 
 def optimum(motion):
-    return Optimum(10.0, motion, "optimal", "solved", 1e-9, 12, "ipopt", 0.5, np.zeros((1000, 8)))
+    return Optimum(10.0, motion, "optimal", "solved", 1e-9, 12, "ipopt", 0.5, np.zeros((1001, 8)))
 
 
 SHOWN = {

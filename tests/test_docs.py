@@ -54,7 +54,7 @@ def test_python_runs(page, tmp_path, monkeypatch):
 
 
 def test_the_task_that_is_added_can_be_certified(interpreted):
-    from ballbot_baselines.optimum import find_optimum
+    from ballbot_baselines import find_optimum
     from ballbot_gym.certified.cache import episode
 
     names = {"__name__": "sprint"}

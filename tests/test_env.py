@@ -319,9 +319,9 @@ def test_frames_are_images_that_show_the_lean(task, physics, make_env):
     assert widths[1] > 2 * widths[0]
 
 
-def test_without_viser_there_is_no_page_and_the_error_says_how_to_get_one(monkeypatch, make_env):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ImportError, match=r'render_mode="human".*needs viser.*ballbot-gym\[play\]'):
+def test_without_its_library_there_is_no_page_and_the_error_says_how_to_get_one(monkeypatch, make_env):
+    monkeypatch.setitem(sys.modules, "websockets", None)
+    with pytest.raises(ImportError, match=r'render_mode="human".*needs websockets.*ballbot-gym\[play\]'):
         make_env(render_mode="human")
     assert make_env().metadata["render_modes"] == ["rgb_array"]
 

@@ -16,7 +16,7 @@ def run(code, *blocked):
 
 
 MISSING = [  # in an order in which nothing imports what is missing later
-    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
+    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0', compile=True)", "torch", "train"),
     (
         "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
         *("scipy", "baselines"),
@@ -25,7 +25,7 @@ MISSING = [  # in an order in which nothing imports what is missing later
         "from ballbot_gym.trajectory import Trajectory; Trajectory([0, 1], [[0] * 8] * 2, [[0, 0]]).plot()",
         *("matplotlib", "train"),
     ),
-    ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
+    ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "websockets", "play"),
     (
         "from ballbot_train.work.executors import Workers, completed; list(completed([(0, int, ())], Workers(ray='local')))",
         *("ray", "ray"),
@@ -82,7 +82,7 @@ for package in ("ballbot_gym", "ballbot_baselines", "ballbot_train"):
 """
     lines = run(code, *EXTRAS).splitlines()
     assert [line for line in lines if not line.startswith(("light ", "named "))] == []
-    for name in ("ballbot_baselines.ocp", "ballbot_gym.batch", "ballbot_train.learning.ppo"):
+    for name in ("ballbot_baselines.solvers.ocp", "ballbot_gym.batch", "ballbot_train.learning.ppo"):
         assert any(line.startswith(f"named {name} ") for line in lines)
     for name in ("ballbot_gym.env", "ballbot_train"):
         assert f"light {name}" in lines
@@ -119,5 +119,5 @@ for task in ballbot_gym.TASKS.values():
     check_env(env.unwrapped)
     env.close()
 """
-    wrote = run(code, "pybullet", "viser")
+    wrote = run(code, "pybullet", "websockets")
     assert wrote.splitlines() == 4 * ["mujoco (480, 640, 3)"]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ballbot_baselines import batched, find_optimum
+from ballbot_baselines import find_optima, find_optimum
 from ballbot_gym import ops
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -35,7 +35,7 @@ def test_the_optimum_of_a_cost_that_no_optimizer_can_use_is_refused(name):
     with pytest.raises(ValueError, match=f"{task.id}: {message}"):
         find_optimum(task, robot, x, c)
     with pytest.raises(ValueError, match=f"{task.id}: {message}"):
-        batched.find_optima(task, robot, x[np.newaxis], c[np.newaxis])
+        find_optima(task, robot, x[np.newaxis], c[np.newaxis])
 
 
 def test_goals_and_margins_are_checked_as_well():

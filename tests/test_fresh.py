@@ -128,7 +128,7 @@ def test_wilson_s_interval_is_not_empty_where_nothing_failed():
 
 def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(monkeypatch):
     optima = fresh.find_optima("stabilize", 2, 0, 1)
-    from ballbot_baselines import certification
+    from ballbot_baselines.optimum import certification
 
     monkeypatch.setattr(certification, "optimum_of", None)  # whoever calls it again fails
     again = fresh.find_optima("stabilize", 2, 0, 1)
@@ -168,3 +168,15 @@ def test_validation_prices_an_episode_without_success_as_failing_at_once():
     figures = training.score_and_validate(idle, task)
     assert figures["validation/success"] == 0
     assert figures["validation/cost"] >= task.survival_pay
+
+
+def test_results_of_another_policy_are_not_replaced(tmp_path):
+    evaluate("shac", task="stabilize", fresh=2, out=tmp_path)
+    before = (tmp_path / "fresh.json").read_bytes()
+    for policy, other in (("ppo", {}), ("shac", {"robot": "rolling"}), ("shac", {"randomization": "late"})):
+        changed = next(iter(other), "policy")
+        with pytest.raises(ValueError, match=f"holds results of {changed} .*; give another --out"):
+            evaluate(policy, task="stabilize", fresh=2, out=tmp_path, **other)
+    assert (tmp_path / "fresh.json").read_bytes() == before
+    evaluate("shac", task="stabilize", fresh=3, out=tmp_path)
+    assert (tmp_path / "fresh.json").read_bytes() != before

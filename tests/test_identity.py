@@ -1,13 +1,16 @@
 """What is continued, compared or read again is told apart by content, and not by a name."""
 
+import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from ballbot_gym import TASKS, Stabilize, named_robot
+from ballbot_gym import TASKS, Stabilize, Turn, named_robot
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import observation_digest, problem_digest, robot_digest
+from ballbot_gym.identity import observation_digest, problem_digest
 from ballbot_gym.robots import ROBOTS, Robot
 from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
@@ -46,13 +49,95 @@ def test_problems_of_one_name_differ_where_cost_observation_or_robot_differ() ->
     heavier = replace(PAPER, body_mass=15.1)
     digests = [problem_digest(task, robot) for task in tasks for robot in (PAPER, heavier)]
     assert len(set(digests)) == 6
-    assert robot_digest(PAPER) != robot_digest(heavier)
     assert (
         observation_digest(tasks[0], PAPER)
         == observation_digest(tasks[1], heavier)
         != observation_digest(tasks[2], PAPER)
     )
     assert problem_digest(Stabilize(), PAPER) == digests[0]
+
+
+def folded(self, x, c):
+    return np.abs(Stabilize.observe(self, x, c))
+
+
+def clipped(self, x, c):
+    return np.minimum(Stabilize.observe(self, x, c), 1.5)
+
+
+def coarse_near_zero(self, x, c):
+    seen = Stabilize.observe(self, x, c)
+    return np.where(np.abs(seen) < 0.02, 0.0, seen)
+
+
+@pytest.mark.parametrize("observe", [folded, clipped, coarse_near_zero])
+def test_observations_differ_that_differ_only_for_negative_far_or_small_values(observe: Callable) -> None:
+    changed = type("Stabilize", (Stabilize,), {"observe": observe})()
+    assert observation_digest(changed, PAPER) != observation_digest(Stabilize(), PAPER)
+    assert problem_digest(changed, PAPER) != problem_digest(Stabilize(), PAPER)
+
+
+class FastTurn(Turn):
+    """Observes fast turns alone in another way."""
+
+    def observe(self, x, c):
+        return Turn.observe(self, x, np.where(np.asarray(c) > 6.0, 6.0, c))
+
+
+class LateTurn(Turn):
+    """Costs more late in an episode."""
+
+    clock = True
+
+    def cost(self, x, u, c):
+        return super().cost(x, u, c[:-1]) * (1.0 + 0.1 * (c[-1] > 4.0))
+
+    def observe(self, x, c):
+        return super().observe(x, c[:-1])
+
+
+class EarlyTurn(LateTurn):
+    """The same, and nothing costs more."""
+
+    def cost(self, x, u, c):
+        return Turn.cost(self, x, u, c[:-1])
+
+
+def test_problems_differ_that_differ_only_for_some_constants_or_times() -> None:
+    assert observation_digest(FastTurn(), PAPER) != observation_digest(Turn(), PAPER)
+    assert observation_digest(Turn(max_speed=3.0), replace(PAPER, com_height=0.5)) == observation_digest(Turn(), PAPER)
+    LateTurn.__name__ = EarlyTurn.__name__ = "Turn"
+    LateTurn.goal = EarlyTurn.goal = lambda self, x, c: Turn.goal(self, x, c[:-1])
+    assert problem_digest(LateTurn(), PAPER) != problem_digest(EarlyTurn(), PAPER)
+
+
+class Picky(Stabilize):
+    """Refuses to observe what is far from its episodes."""
+
+    def observe(self, x, c):
+        if abs(float(x[0])) > 5:
+            raise ValueError("nobody has been there")
+        return super().observe(x, c)
+
+
+def test_a_task_may_refuse_states_that_no_episode_reaches() -> None:
+    assert (
+        observation_digest(Picky(), PAPER)
+        == observation_digest(Picky(), PAPER)
+        != observation_digest(Stabilize(), PAPER)
+    )
+    assert problem_digest(Picky(), PAPER) == problem_digest(Picky(), PAPER)
+
+
+def test_a_policy_of_an_earlier_version_is_read_by_name_and_size(tmp_path: Path) -> None:
+    path = save_policy(tmp_path / "policy", PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))), {})
+    document = json.loads(path.read_text())
+    for field in ("robot_numbers", "observation_digest"):
+        del document["spec"][field]
+    path.write_text(json.dumps(document))
+    assert load_policy(path, Stabilize()).network.spec.observation_digest == ""
+    with pytest.raises(PolicyError, match="Turn"):
+        load_policy(path, Turn())
 
 
 @pytest.mark.parametrize("robot", list(ROBOTS))
@@ -69,7 +154,7 @@ def test_a_run_continues_with_the_same_problem_alone(tmp_path: Path, monkeypatch
     (unfinished / "job.json").write_text("[]")
     open_run(tmp_path, 1, chosen, episodes=5)
     monkeypatch.setitem(TASKS, "stabilize", Dearer)
-    with pytest.raises(ValueError, match="stabilize: its episodes, costs, limits, observations or robot have changed"):
+    with pytest.raises(ValueError, match="another problem stabilize: its costs have changed since"):
         open_run(tmp_path, 1, chosen, episodes=5)
     jobs.unlock(tmp_path)
 

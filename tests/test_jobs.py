@@ -219,3 +219,29 @@ def test_of_nested_settings_only_those_that_differ_are_named(tmp_path):
     held = {"seed": 1, "settings": {"gamma": 0.99, "hidden": [64, 64]}}
     with pytest.raises(ValueError, match=r"holds a run of settings gamma 0\.99, not 0\.98; give another --out"):
         jobs.check_same(held, {"seed": 1, "settings": {"gamma": 0.98, "hidden": (64, 64)}}, tmp_path, "a run")
+
+
+WITHOUT_GUARD = """
+from ballbot_train import jobs
+from pathlib import Path
+from test_jobs import ignore, job, squares
+
+if GUARD:
+    jobs.run([job(squares, Path("log"), range(i, i + 2), f"job{i}") for i in (0, 2)], Path("out"), 2, ignore)
+"""
+
+
+@pytest.mark.parametrize("guard", ["True", "__name__ == '__main__'"])
+def test_a_script_without_a_guard_learns_that_it_needs_one(guard, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(WITHOUT_GUARD.replace("GUARD", guard))
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    ended = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    if guard == "True":
+        assert 'must do its work under if __name__ == "__main__":' in ended.stderr.splitlines()[-1]
+        assert "out of memory" not in ended.stderr.splitlines()[-1]
+    else:
+        assert ended.returncode == 0, ended.stderr

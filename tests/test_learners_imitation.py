@@ -7,9 +7,9 @@ import pytest
 import torch
 from resuming import goes_on_as_if_never_stopped
 
-from ballbot_baselines import batched
-from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.tvlqr import TvlqrController, tube_gains
+from ballbot_baselines import Backoff, TvlqrController, find_optima, find_optimum
+from ballbot_baselines.optimum import batched
+from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
@@ -62,8 +62,10 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way():
     robot = replace(params, body_mass=1.3 * params.body_mass, force_limit=0.9 * params.force_limit)
     x, under_way = observations[:, :8] * task.observation_scale, robot.force_limit * observations[:, 16:]
     later = np.stack(dynamics.step(robot, tuple(x.T), tuple(under_way.T), task.control_dt, 2), 1)
-    best = batched.find_optima(task, robot, later, np.zeros((len(x), 0)))
-    off = np.abs(actions - np.clip(best.forces[:, 0] / robot.force_limit, -1, 1)).max(1)[best.solved]
+    best = find_optima(task, robot, later, np.zeros((len(x), 0)))
+    solved = [i for i, optimum in enumerate(best) if optimum]
+    forces = np.array([best[i].trajectory.u[0] for i in solved])
+    off = np.abs(actions[solved] - np.clip(forces / robot.force_limit, -1, 1)).max(1)
     assert np.percentile(off, 25) < 1e-5  # where the expert acts: an optimum goes on being optimal
     assert np.percentile(off, 90) < 0.1  # where the learner acts: feedback about it is linear
 
@@ -135,7 +137,7 @@ def test_optima_are_found_one_by_one_where_they_cannot_be_found_at_once(monkeypa
     task, params, config = make_task("stabilize"), default_params(), replace(TINY_DAGGER, episodes_per_iteration=2)
     at_once, alone = dagger.Dagger(task, params, config), dagger.Dagger(task, params, config)
     at_once.iterate()
-    monkeypatch.setattr(dagger.batched, "solves", lambda task, params: False)
+    monkeypatch.setattr(batched, "_solves", lambda task, params: False)
     alone.iterate()
     first, second = (each.state_dict()["samples"][1].numpy() for each in (at_once, alone))
     np.testing.assert_allclose(second[:20], first[:20], atol=0.02)

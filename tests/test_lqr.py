@@ -3,9 +3,10 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines.linearize import discretize, goal_weight, quadratic_cost
-from ballbot_baselines.lqr import LqrController, discrete_lqr, equilibrium_gain, tracking_gains
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import LqrController, find_optimum
+from ballbot_baselines.feedback.lqr import equilibrium_gain
+from ballbot_baselines.solvers.linearize import discretize, goal_weight, quadratic_cost
+from ballbot_baselines.solvers.riccati import discrete_lqr, tracking_gains
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize

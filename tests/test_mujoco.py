@@ -1,9 +1,11 @@
 """What MuJoCo's simulators do beyond what holds for every physics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.robots import named_robot
@@ -86,3 +88,15 @@ def test_a_ball_that_is_thrown_up_flies_and_comes_down_with_its_energy_but_what_
     assert max(heights) > 0.5
     assert {n for n, h in zip(normals, heights, strict=True) if h > 0.01} == {0.0}
     assert min(heights) > -1e-3  # it lands on the floor
+
+
+def test_an_instability_leaves_no_file_in_the_current_folder(tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    robot = replace(named_robot("paper"), force_limit=1e30)
+    simulator = make_simulator("mujoco", robot, 0.02)
+    simulator.reset((0.0,) * 8)
+    for _ in range(10):
+        simulator.step((1e25, 1e25))
+    assert simulator.is_unstable()
+    assert list(tmp_path.iterdir()) == []
+    assert "MuJoCo: Nan, Inf or huge value" in caplog.text

@@ -5,8 +5,8 @@ pytest.importorskip("casadi")
 
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
-from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.horizon import HorizonQp
+from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
+from ballbot_baselines.feedback.horizon import HorizonQp
 from ballbot_gym import certified, dynamics
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import rollout, simulate
@@ -60,7 +60,7 @@ def test_the_costate_is_the_slope_of_the_optimal_cost(params):
     for i in (0, 6):
         unit = h * np.eye(8)[i]
         costs = [find_optimum(rest, params, optimum.trajectory.x[k] + s * unit, NO_CONSTANTS).cost for s in (1, -1)]
-        assert optimum.costates[k - 1, i] == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=1e-3, abs=1e-3)
+        assert optimum.slopes[k, i] == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=1e-3, abs=1e-3)
 
 
 class AtRest:

@@ -8,8 +8,8 @@ import casadi
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import TrajoptController
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import dynamics, omni
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
@@ -22,7 +22,6 @@ from ballbot_gym.tasks import Stabilize
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
-from ballbot_train.report.simulation import World
 
 SPREAD = np.array([1, 1, 0.8, 0.8, 2, 2, 2, 2, 3, 3, 5.0])
 
@@ -300,17 +299,10 @@ def test_a_free_heading_costs_nothing(robot):
 
 
 def test_what_knows_no_wheels_says_so(robot):
-    from ballbot_baselines import batched
-
     task = make_task("stabilize", "omni")
-    assert not batched.solves(task, robot)
-    with pytest.raises(NotImplementedError, match="no robot with wheels"):
-        batched.find_optima(task, robot, np.zeros((1, 8)), np.zeros((1, 0)))
     with pytest.raises(ValueError, match="pushes are forces Fx, Fy, which a robot with wheels does not have"):
         BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
     with pytest.raises(ValueError, match="omni has three wheels, and neither a frame nor mirror images"):
         PolicySpec.of(task, robot="omni", frame="orbit")
     with pytest.raises(ValueError, match="sac does not support robots with wheels; train with apg or dagger"):
         LEARNERS["sac"].make(task, robot, LEARNERS["sac"].settings("stabilize"), 0)
-    with pytest.raises(ValueError, match="the playground knows no robot with wheels"):
-        World("stabilize", "omni")

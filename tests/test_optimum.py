@@ -1,3 +1,6 @@
+import contextlib
+import signal
+
 import numpy as np
 import pytest
 
@@ -5,10 +8,9 @@ pytest.importorskip("casadi")
 
 import casadi
 
-from ballbot_baselines import optimum as optimum_module
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.ocp import FEASIBLE, Ocp, OcpSolver
-from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
+from ballbot_baselines import Backoff, LqrController, find_optimum, plan_to_track
+from ballbot_baselines.optimum import find as optimum_module
+from ballbot_baselines.solvers.ocp import FEASIBLE, Ocp, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
@@ -227,3 +229,25 @@ def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(p
     monkeypatch.setattr(optimum_module, "find_optimum", find)
     assert plan_to_track(Stabilize(), params, x0, [], reserve).is_optimal
     assert failed == [reserve]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_within_a_solver_is_not_lost(number, monkeypatch):
+    """CasADi prints a KeyboardInterrupt and goes on."""
+    from ballbot_baselines import ocp
+
+    def interrupted(number, frame):
+        raise KeyboardInterrupt
+
+    def swallowing(*given, **named):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(number)
+        return {}
+
+    before = signal.signal(number, interrupted)
+    try:
+        with pytest.raises(KeyboardInterrupt), ocp._interrupts_kept():
+            swallowing()
+        assert signal.getsignal(number) is interrupted
+    finally:
+        signal.signal(number, before)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ballbot_gym.drawing import Drawing, GroundPath, Robot
-from ballbot_gym.picture import YAW, picture
+from ballbot_gym.drawing.picture import YAW, picture
 from ballbot_gym.tasks.marker import Marker
 
 UPRIGHT = np.zeros(8)

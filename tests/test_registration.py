@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import tomllib
 
-from ballbot_baselines.lqr import LqrController, equilibrium_gain
+from ballbot_baselines import LqrController
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import TASKS, Task, certified, files, named_robot, register_robot, register_task
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
@@ -179,7 +180,7 @@ class Nearby(Stabilize):
 @pytest.fixture
 def counted(monkeypatch, interpreted):
     """Counts the optima that are computed."""
-    from ballbot_baselines import certification
+    from ballbot_baselines.optimum import certification
 
     find, starts = certification.find_optimum, []
 
@@ -236,7 +237,7 @@ def test_any_task_and_robot_has_a_row(counted):
 
 
 def test_a_goal_that_cannot_be_reached_names_the_methods_to_look_at(monkeypatch):
-    from ballbot_baselines import certification
+    from ballbot_baselines.optimum import certification
 
     def find_none(*problem, **options):  # which takes long to find out
         raise PlanError("no feasible episode")

@@ -1,5 +1,9 @@
 """Strips and films of episodes."""
 
+import os
+import signal
+import tempfile
+
 import imageio.v2 as imageio
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
+from ballbot_train import cli
 from ballbot_train.commands.replay import replay
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import film_frames, film_times, write_film
@@ -119,3 +124,25 @@ def test_the_command_films_a_trajectory_file(tmp_path):
     replay((str(tmp_path / "mine.npz"),), format="webp", seconds=0.2, fps=10, width=160, out=tmp_path / "out")
     name = file_part(str(tmp_path / "mine.npz"))  # two files of one name in two folders have films of their own
     assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{name}.webp"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_film_that_is_stopped_leaves_no_file(number, tmp_path, monkeypatch, capsys):
+    """A command ends so on Ctrl-C, and on SIGTERM, as schedulers and `timeout` send it."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+
+    def frames():
+        yield np.zeros((32, 32, 3), np.uint8)
+        assert list((tmp_path / "temporary").iterdir())
+        os.kill(os.getpid(), number)
+        yield np.zeros((32, 32, 3), np.uint8)
+
+    monkeypatch.setattr(cli, "_call", lambda *typed: write_film(frames(), tmp_path / "out" / "film.mp4"))
+    monkeypatch.setattr("sys.argv", ["ballbot", "replay"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 128 + number
+    assert "interrupted" in capsys.readouterr().err
+    assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -24,7 +24,7 @@ ENVS = 32
 def policies(task, params):
     """Policies by name: functions of state (8, B), observation (B, no) and a generator to actions (B, 2)."""
     pytest.importorskip("scipy")
-    from ballbot_baselines.lqr import discrete_lqr
+    from ballbot_baselines.solvers.riccati import discrete_lqr
     from ballbot_train.policy.files import shipped_policies
     from ballbot_train.policy.network import load_network
 

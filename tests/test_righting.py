@@ -8,8 +8,10 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines import LqrController, NmpcController, TrajoptController, certification, find_optimum, righting
-from ballbot_baselines.ocp import FEASIBLE, OcpSolver
+from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optimum
+from ballbot_baselines.optimum import certification
+from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.ocp import FEASIBLE, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballbot_baselines import certification, righting
-from ballbot_baselines.lqr import discrete_lqr
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import Backoff, find_optimum
+from ballbot_baselines import Backoff, NmpcController, find_optimum
+from ballbot_baselines.optimum import certification
+from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import certified, dynamics
 from ballbot_gym.engines.bullet import BulletContactSimulator
 from ballbot_gym.engines.closed_form import Rk4Simulator

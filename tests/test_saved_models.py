@@ -20,9 +20,10 @@ from gymnasium.wrappers import (
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from ballbot_gym import certified
+from ballbot_gym import TASKS, Stabilize, certified, ops
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_train import BallbotVecEnv, RegretCallback
 from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
@@ -254,3 +255,31 @@ def test_a_users_activation_is_not_taken_for_that_of_torch(tmp_path):
     PPO("MlpPolicy", envs(), policy_kwargs={"activation_fn": Tanh}, device="cpu").save(tmp_path / "model.zip")
     with pytest.raises(PolicyError, match=r"the activation .*Tanh"):
         acts(tmp_path / "model.zip")
+
+
+class Halved(Stabilize):
+    """Stabilize with another observation, of the same size and bounds."""
+
+    def observe(self, x, c):
+        return ops.stack(tuple(0.5 * value for value in ops.components(super().observe(x, c))), like=x)
+
+
+@pytest.mark.parametrize("marked_by", ["vec env", "callback", "nobody"])
+def test_a_model_is_known_by_its_observation_where_its_file_can_hold_it(marked_by, tmp_path, monkeypatch):
+    if marked_by == "vec env":
+        venv = BallbotVecEnv(gymnasium.make_vec("BallbotStabilize-v0", num_envs=2).unwrapped)
+    else:
+        venv = envs()
+    settings = {"n_steps": 4, "batch_size": 4, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}, "device": "cpu"}
+    model = PPO("MlpPolicy", venv, **settings)
+    model.learn(4, RegretCallback("stabilize", validation_episodes=2) if marked_by == "callback" else None)
+    model.save(tmp_path / "model.zip")
+    policies = model, tmp_path / "model.zip", PPO.load(tmp_path / "model.zip", device="cpu")
+    assert [evaluate(policy, "stabilize", 1, "rk4").episodes for policy in policies] == [1, 1, 1]
+    monkeypatch.setitem(TASKS, "stabilize", Halved)
+    for policy in policies:
+        if marked_by == "nobody":  # nothing tells it
+            evaluate(policy, "stabilize", 1, "rk4")
+        else:
+            with pytest.raises(PolicyError, match="was trained on other observations"):
+                evaluate(policy, "stabilize", 1, "rk4")

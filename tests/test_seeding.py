@@ -7,7 +7,6 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from ballbot_baselines import batched
 from ballbot_gym import seeding
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv
@@ -17,7 +16,7 @@ from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import BallbotVecEnv
 from ballbot_train.evaluation import fresh, runner
-from ballbot_train.learning import demonstrations
+from ballbot_train.learning import dagger, demonstrations
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.rsl import RslVecEnv
 
@@ -76,7 +75,7 @@ def test_trainings_with_neighbouring_seeds_share_no_start(name, starts, monkeypa
     def plan(*arguments, **options):
         raise Drawn
 
-    monkeypatch.setattr(batched, "find_optima", plan)
+    monkeypatch.setattr(dagger, "find_optima", plan)
     settings = LEARNERS[name].settings("stabilize")
     known = {field.name for field in fields(settings)}
     settings = replace(settings, **{key: value for key, value in SMALL.items() if key in known})

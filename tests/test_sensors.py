@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import pytest
 
-from ballbot_baselines.kalman import StateFromSensors
+from ballbot_baselines import StateFromSensors
 from ballbot_gym import certified, dynamics, omni, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import TRACKS

@@ -1,5 +1,6 @@
 """Data sets as shards hold what one file would hold, survive a kill, and are read one shard at a time."""
 
+import hashlib
 import json
 from contextlib import contextmanager
 from dataclasses import replace
@@ -150,3 +151,56 @@ def test_certified_shards_are_the_certified_set(tmp_path):
         assert np.array_equal(arrays[name], whole[name]), name
     assert arrays["episodes"].tolist() == list(range(6))
     assert json.loads((tmp_path / "shards" / "stabilize" / shards.MANIFEST).read_text())["shards"]["0"]["episodes"] == 6
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "reference://x",
+        "simplecache::http://localhost:9/x",
+        "filecache://x",
+        "zip://a::file:///tmp/b.zip",
+        "github://a:b@c/d",
+        "s3://a::file:///b",
+        "dir://x",
+        "blockcache://x",
+    ],
+)
+def test_addresses_that_are_no_storage_are_refused(url):
+    with pytest.raises(
+        files.FileError, match=r"cannot be read: .*is no storage; give a folder, or a URL that begins with"
+    ):
+        shards.Shards(url)
+
+
+@pytest.mark.parametrize("name", ["what?", "a::b", "a#b", "50%25", "*", "[x]", "{x}"])
+def test_a_set_is_in_its_folder_whatever_that_is_called(name, tmp_path):
+    made(str(tmp_path / name), tmp_path / "out", 9)
+    assert {path.name for path in tmp_path.iterdir()} == {name, "out", "log"}
+    assert shards.Shards(tmp_path / name).episodes == 9
+
+
+@pytest.mark.parametrize("of", ["episodes", "number"])
+@pytest.mark.parametrize("value", [10**9, -1])
+def test_a_manifest_of_impossible_sizes_is_damaged(of, value, tmp_path):
+    made(str(tmp_path / "set"), tmp_path / "out", 9)
+    path = tmp_path / "set" / shards.MANIFEST
+    manifest = json.loads(path.read_text())
+    if of == "episodes":
+        manifest["shards"]["0"]["episodes"] = value
+    else:
+        manifest["shards"][str(value)] = manifest["shards"].pop("0")
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(files.FileError, match=r"manifest\.json is damaged .*at most 1000000 are possible"):
+        shards.Shards(tmp_path / "set")
+
+
+def test_a_shard_that_unpacks_to_far_more_than_it_holds_is_refused(tmp_path):
+    made(str(tmp_path / "set"), tmp_path / "out", 5)
+    path = files.write_npz(tmp_path / "set" / "shard-000000.npz", {"i": np.zeros(2**24, np.uint8)})
+    assert path.stat().st_size < 2**15
+    manifest = json.loads((tmp_path / "set" / shards.MANIFEST).read_text())
+    manifest["shards"]["0"]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    (tmp_path / "set" / shards.MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(files.FileError, match="unpacks to 16 MiB; at most 0 MiB are read"):
+        list(shards.Shards(tmp_path / "set"))

@@ -1,18 +1,21 @@
 """Whoever submits to the leaderboard is believed nothing: each step of each episode must follow from the one before."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ballbot_baselines.lqr import discrete_lqr, equilibrium_gain
+from ballbot_baselines.feedback.lqr import equilibrium_gain
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import certified, dynamics, files, named_robot
 from ballbot_gym.engines import PHYSICS, installed_physics, make_simulator
 from ballbot_gym.env import make_task
 from ballbot_train import evaluate
 from ballbot_train.commands.submit import submit as submit_command
 from ballbot_train.evaluation import recordings, submissions
-from ballbot_train.evaluation.released import release, unbacked
+from ballbot_train.evaluation.released import digest_of, release, unbacked
 from ballbot_train.evaluation.results import read_results
 from ballbot_train.evaluation.steering import costates
 from ballbot_train.evaluation.submissions import (
@@ -354,6 +357,17 @@ def test_a_refused_submission_replaces_and_removes_nothing(submitted, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_another_submission_of_the_same_name_is_not_overwritten(submitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(submissions, "verify", lambda path, content=None: verify(path, EPISODES, content))
+    folder, out = submitted()[0], tmp_path / "out"
+    submit_command(folder, name="mine", out=out)
+    before = (out / "turn-mine-rk4.npz").read_bytes()
+    submit_command(folder, name="mine", out=out)
+    with pytest.raises(SubmissionError, match="is another submission of this name"):
+        submit_command(folder, name="mine", link="https://example.org/other", out=out)
+    assert (out / "turn-mine-rk4.npz").read_bytes() == before
+
+
 def test_a_row_says_whose_motion_it_is(submitted, tmp_path):
     entry = verify(submitted()[1], EPISODES)
     assert entry.optima == 0
@@ -384,8 +398,31 @@ def test_a_row_of_the_leaderboard_says_what_its_episodes_say(entry):
 
 
 def test_every_row_is_backed_by_a_submission_beside_it_or_in_a_release():
-    """A pull request brings both. This takes seconds for each submission."""
-    assert unbacked() == []
+    """A pull request brings both. This takes seconds for each submission.
+
+    With $BALLBOT_RECORDINGS, the folder of the submissions of all releases, no list is believed: `make verify` sets it.
+    """
+    downloaded = os.environ.get("BALLBOT_RECORDINGS")
+    assert unbacked(downloaded=Path(downloaded) if downloaded else None) == []
+
+
+def test_a_row_and_its_line_in_the_list_that_are_edited_together_do_not_match_the_recording(submitted, tmp_path):
+    """A pull request can change both. So a reviewer verifies the recordings of releases, which it cannot change."""
+    board, downloaded = tmp_path / "board", tmp_path / "downloaded"
+    entry = verify(submitted()[1], EPISODES)
+    entry.write(board)
+    files.write(downloaded / "any-name.npz", submitted()[1].read_bytes())
+    files.write(board / "released.txt", f"{digest_of(entry)}  {entry.file}\n")
+    assert unbacked(board, EPISODES) == unbacked(board, EPISODES, downloaded) == []
+    better = replace(entry, costs=[1.001 * result.optimum for result in entry.results()])
+    better = replace(better, **summary(better))
+    for forged in (better, replace(better, submission="0" * 64)):
+        (board / entry.file).unlink()
+        forged.write(board)
+        files.write(board / "released.txt", f"{digest_of(forged)}  {forged.file}\n")
+        assert unbacked(board, EPISODES) == []
+        (wrong,) = unbacked(board, EPISODES, downloaded)
+        assert "its submission gives another row" in wrong or "no submission lies beside it or was downloaded" in wrong
 
 
 @pytest.mark.parametrize("task", ["stabilize", "turn"])

@@ -11,9 +11,9 @@ pytest.importorskip("torch")
 
 
 from ballbot_baselines import LqrController
-from ballbot_baselines.adaptive import AdaptiveNmpcController
-from ballbot_baselines.kalman import TrackFilter
-from ballbot_baselines.trajopt import cautious_trajopt
+from ballbot_baselines.feedback.adaptive import AdaptiveNmpcController
+from ballbot_baselines.feedback.kalman import TrackFilter
+from ballbot_baselines.feedback.trajopt import cautious_trajopt
 from ballbot_gym import certified
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes

@@ -15,9 +15,9 @@ import torch
 from builders import measured
 from resuming import goes_on_as_if_never_stopped, parameters
 
-from ballbot_baselines.optimum import Backoff
+from ballbot_baselines import Backoff
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import problem_digest
+from ballbot_gym.identity import problem_parts
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -153,7 +153,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     task, params = TASKS["stabilize"](), default_params()
     config = apg.ApgConfig(iterations=1, evaluations=1, num_envs=2, episode_seconds=0.04, hidden=(4,))
     about = {"learner": "apg", "task": "stabilize"}
-    (tmp_path / "config.json").write_text(json.dumps(about | {"problem": problem_digest(task, params)}))
+    (tmp_path / "config.json").write_text(json.dumps(about | {"problem": problem_parts(task, params)}))
     for content in (b"", b"garbage", b"PK\x03\x04"):
         (tmp_path / "checkpoint.pt").write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
@@ -302,3 +302,25 @@ def test_a_training_in_another_thread_comes_to_its_end(short_run, tmp_path, monk
     with ThreadPoolExecutor(1) as pool:
         pool.submit(short_run).result()
     assert (tmp_path / "policy.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "again"), [(signal.SIGINT, "press Ctrl-C again"), (signal.SIGTERM, "send the signal again")]
+)
+def test_a_training_that_is_stopped_says_how_to_stop_it_at_once(number, again, capsys):
+    with training._interruptible() as interrupted:
+        signal.raise_signal(number)
+        assert interrupted()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert f"saving; {again} to stop at once" in capsys.readouterr().out
+
+
+def test_the_handler_of_a_program_that_embeds_python_stays(monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    with training._interruptible() as interrupted:
+        monkeypatch.undo()
+        assert signal.getsignal(signal.SIGTERM) is before
+        assert not interrupted()
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -270,7 +270,7 @@ def casadi_gradient(task, params, x0, gain, forces):
 
 @pytest.mark.parametrize(("steps", "feedback"), [(150, True), (25, False)], ids=["3 s under LQR", "0.5 s open loop"])
 def test_gradient_of_the_cost_agrees_with_finite_differences_and_casadi(steps, feedback, params):
-    lqr = pytest.importorskip("ballbot_baselines.lqr")
+    lqr = pytest.importorskip("ballbot_baselines.solvers.riccati")
     batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)
     gain = lqr.discrete_lqr(batch.task, params, np.zeros(8), np.zeros(2), np.zeros(0))[0] * feedback
     gain = torch.from_numpy(gain)

@@ -1,5 +1,6 @@
 """The robot in MuJoCo, as a chain of joints, and with contact where the ball rolls."""
 
+import logging
 import math
 from types import ModuleType
 from typing import Any
@@ -292,7 +293,13 @@ def import_mujoco() -> ModuleType:
     """MuJoCo, or an ImportError that says how to get it."""
     with imports_of('physics="mujoco"', "mujoco"):
         import mujoco
+    if mujoco.get_mju_user_warning() is None:  # by default a warning also goes to MUJOCO_LOG.TXT in the current folder
+        mujoco.set_mju_user_warning(_log_warning)
     return mujoco
+
+
+def _log_warning(text: str) -> None:
+    logging.getLogger(__name__).warning("MuJoCo: %s", text)
 
 
 def _inertial(mass: float, *inertia: float) -> dict[str, Any]:

@@ -14,30 +14,30 @@ from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
-    from ballbot_baselines.batched import find_optima
-    from ballbot_baselines.guess import along_path
-    from ballbot_baselines.kalman import StateFromSensors
-    from ballbot_baselines.lqr import LqrController
-    from ballbot_baselines.measured import Regret, regret
-    from ballbot_baselines.nmpc import NmpcController, offset_free_nmpc
-    from ballbot_baselines.optimum import Optimum, find_optimum, plan_to_track
-    from ballbot_baselines.shooting import Backoff
-    from ballbot_baselines.trajopt import TrajoptController
-    from ballbot_baselines.tvlqr import TvlqrController
+    from ballbot_baselines.feedback.kalman import StateFromSensors
+    from ballbot_baselines.feedback.lqr import LqrController
+    from ballbot_baselines.feedback.nmpc import NmpcController, offset_free_nmpc
+    from ballbot_baselines.feedback.trajopt import TrajoptController
+    from ballbot_baselines.feedback.tvlqr import TvlqrController
+    from ballbot_baselines.optimum.find import find_optima, find_optimum, plan_to_track
+    from ballbot_baselines.optimum.measured import Regret, regret
+    from ballbot_baselines.optimum.optimum import Optimum
+    from ballbot_baselines.solvers.guess import along_path
+    from ballbot_baselines.solvers.shooting import Backoff
 
 need(__name__, "casadi", "scipy")
 
 CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
-    "lqr": called("ballbot_baselines.lqr:LqrController"),
-    "trajopt": called("ballbot_baselines.trajopt:TrajoptController"),
-    "nmpc": called("ballbot_baselines.nmpc:NmpcController"),
+    "lqr": called("ballbot_baselines.feedback.lqr:LqrController"),
+    "trajopt": called("ballbot_baselines.feedback.trajopt:TrajoptController"),
+    "nmpc": called("ballbot_baselines.feedback.nmpc:NmpcController"),
 }
 """Every controller by its name on the command line. To add a controller, write one file and add one line here."""
 
-_ADAPTIVE = called("ballbot_baselines.adaptive:AdaptiveNmpcController")
+_ADAPTIVE = called("ballbot_baselines.feedback.adaptive:AdaptiveNmpcController")
 VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
-    "nmpc-offset-free": called("ballbot_baselines.nmpc:offset_free_nmpc"),
-    "cautious": called("ballbot_baselines.trajopt:cautious_trajopt"),
+    "nmpc-offset-free": called("ballbot_baselines.feedback.nmpc:offset_free_nmpc"),
+    "cautious": called("ballbot_baselines.feedback.trajopt:cautious_trajopt"),
     "nmpc-adaptive": partial(_ADAPTIVE, ending="-adaptive"),
     "nmpc-ekf": partial(_ADAPTIVE, ending="-ekf"),
     "nmpc-adaptive-ekf": partial(_ADAPTIVE, ending="-adaptive-ekf"),
@@ -69,15 +69,15 @@ __all__ = [
 ]
 
 _MODULES = {
-    "batched": ("find_optima",),
-    "guess": ("along_path",),
-    "kalman": ("StateFromSensors",),
-    "lqr": ("LqrController",),
-    "measured": ("Regret", "regret"),
-    "nmpc": ("NmpcController", "offset_free_nmpc"),
-    "optimum": ("Optimum", "find_optimum", "plan_to_track"),
-    "shooting": ("Backoff",),
-    "trajopt": ("TrajoptController",),
-    "tvlqr": ("TvlqrController",),
+    "feedback.kalman": ("StateFromSensors",),
+    "feedback.lqr": ("LqrController",),
+    "feedback.nmpc": ("NmpcController", "offset_free_nmpc"),
+    "feedback.trajopt": ("TrajoptController",),
+    "feedback.tvlqr": ("TvlqrController",),
+    "optimum.find": ("find_optima", "find_optimum", "plan_to_track"),
+    "optimum.measured": ("Regret", "regret"),
+    "optimum.optimum": ("Optimum",),
+    "solvers.guess": ("along_path",),
+    "solvers.shooting": ("Backoff",),
 }
 __getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

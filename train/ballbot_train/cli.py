@@ -8,8 +8,12 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import sys
+import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -71,10 +75,11 @@ def _run(arguments: list[str]) -> int:
         errors.print(f"ballbot: no command {command!r}; {hint}", style="red")
         return 2
     try:
-        _call(command, options)
+        with _terminated_as_interrupted() as terminated:
+            _call(command, options)
     except KeyboardInterrupt:
         errors.print(f"interrupted; {_again(command, options)}")
-        return 130
+        return 128 + (signal.SIGTERM if terminated else signal.SIGINT)
     except ModuleNotFoundError as error:
         from ballbot_gym.lazy import install
 
@@ -91,6 +96,28 @@ def _run(arguments: list[str]) -> int:
         errors.print(f"ballbot: {error}", style="red")
         return 1
     return 0
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[list[int]]:
+    """SIGTERM, as schedulers and `timeout` send it, interrupts as Ctrl-C does, so that nothing half-written is left behind.
+
+    Yields a list that is not empty after a SIGTERM.
+    """
+    received: list[int] = []
+
+    def on_signal(number: int, frame: object) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if ours:
+        signal.signal(signal.SIGTERM, on_signal)
+    try:
+        yield received
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _call(command: str, options: list[str]) -> Any:

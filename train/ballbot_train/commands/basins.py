@@ -6,6 +6,7 @@ from ballbot_gym.robots import PAPER
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation.controllers import all_behind, controllers_of
+from ballbot_train.evaluation.names import ways_on, with_way
 from ballbot_train.evaluation.runner import open_run
 from ballbot_train.report import figures
 from ballbot_train.work import jobs
@@ -39,12 +40,17 @@ def basins(
     physics = physics_or_default(physics)
     names = chosen[maps.TASK]
     facts = open_run(out, workers, {robot: chosen}, robot, physics=physics, points=points)
+    ways = facts.get("trained_by", {})
     made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)
-    picture = figures.save(figures.basin_figure(made), out / "basins.png")
+    picture = figures.save(figures.basin_figure(made, ways), out / "basins.png")
     jobs.release(out)
     header = ["controller", "recovered", *(f"by lean and {basin.axis}" for basin in made)]
     shares = [[maps.fraction(made, name), *(maps.fraction([basin], name) for basin in made)] for name in names]
-    rows = [[name, *(f"{share:.1%}" for share in group)] for name, group in zip(names, shares, strict=True)]
+    known = ways_on(ways, maps.TASK)
+    rows = [
+        [with_way(name, known.get(name, "")), *(f"{share:.1%}" for share in group)]
+        for name, group in zip(names, shares, strict=True)
+    ]
     print_table(f"Share of the recoverable states, {points} × {points} a map, physics={physics}", header, rows)
     console.print(f"map: {picture}")

@@ -70,13 +70,13 @@ def benchmark(
         rows = robustness.track_rows(results, robot, seed)
         write_results("tracks", rows, results, facts, out)
         title = f"{episodes} certified episodes per task and track, physics={physics}"
-        publish(out, "tracks", title, robustness.TRACK_TABLE, rows)
+        publish(out, "tracks", title, robustness.TRACK_TABLE, rows, facts)
         return
     groups = [Group(task, name, physics, robot) for task, names in chosen.items() for name in names]
     done = run_groups(groups, episodes, out, workers, seed, record=True)
-    rows = leaderboard(done, seed)
+    rows, ways = leaderboard(done, seed), facts.get("trained_by", {})
     write_leaderboard(rows, done, facts, out)
-    regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
+    regrets = figures.save(figures.regret_figure(done, ways), out / "figures" / "regret.png")
     replays, pictures = [], []
     for task, names in chosen.items():
         episode = telling_episode(task, done)
@@ -88,9 +88,9 @@ def benchmark(
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    report = report_page(title, replays, HEADER, table_cells(TABLE, rows), shown, facts)
+    report = report_page(title, replays, HEADER, table_cells(TABLE, rows, ways), shown, facts)
     page = files.write(out / "report.html", report)
-    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows)
+    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows, facts)
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines import certification
+from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import named_problem_digest
+from ballbot_gym.identity import named_problem
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
@@ -81,7 +81,7 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
         about = {
             "certified": make_task(name, robot).problem(),
             "version": provenance()["version"],
-            "problem": named_problem_digest(name, robot),
+            "problem": named_problem(name, robot),
             **robot_setting(robot),
         }
         set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, robot)

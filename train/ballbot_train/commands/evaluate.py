@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ballbot_gym import certified
+from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.randomization import Randomization, checked_randomization
+from ballbot_gym.randomization import Randomization, checked_randomization, track_of
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.options import Filter, WorkersOption
@@ -73,7 +73,7 @@ def evaluate(
     task, policy = task_name(policy, task, robot), behind(policy, filter)
     chosen = controllers_of([task], [policy], robot)
     check_least(0, optima=optima)
-    named = f"{task}-{file_part(policy)}" + (f"-on-{randomization}" if randomization else "")
+    named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     if fresh is not None:
         if physics not in (None, "rk4"):
@@ -90,7 +90,7 @@ def evaluate(
     results = run_groups([group], count, out, workers, seed, record=not varied.active)
     rows = leaderboard(results, seed)
     write_leaderboard(rows, results, facts, out)
-    publish(out, "leaderboard", f"{count} certified episodes of {task}, physics={engine}", TABLE, rows)
+    publish(out, "leaderboard", f"{count} certified episodes of {task}, physics={engine}", TABLE, rows, facts)
     console.print(f"all episodes: {out / 'episodes.csv'}")
 
 
@@ -113,10 +113,13 @@ def _evaluate_fresh(
         raise ValueError(f"optima must be at most the {count} fresh episodes, not {optima}")
     episodes.history_of(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
     jobs.make_folder(out)
+    of = {"task": task, "policy": policy, "robot": robot, "randomization": track_of(varied)}
+    if (out / "fresh.json").exists():  # of the same policy they are replaced
+        about = files.read_json(out / "fresh.json").get("about")
+        held = {name: about.get(name, of[name]) for name in of} if isinstance(about, dict) else {}
+        jobs.check_same(held, of, out, "results")
     facts = provenance() | {
-        "task": task,
-        "policy": policy,
-        "robot": robot,
+        **of,
         "policies": policy_digests({task: [policy]}, robot),
         "seed": seed,
         "episodes": count,

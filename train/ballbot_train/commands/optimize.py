@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS

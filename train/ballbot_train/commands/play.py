@@ -3,9 +3,9 @@
 import signal
 from typing import Literal
 
+from ballbot_gym.drawing.viewer import PORT, Viewer, need_library
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER
-from ballbot_gym.viewer import PORT, Viewer, import_viser
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.report.live_page import PlayPage
 from ballbot_train.report.simulation import Playground, Start
@@ -40,12 +40,14 @@ def play(
         randomization: name of a track, as "unknown": every episode has a robot of it, which the controllers are not told.
     """
     task = task_name(controller or "", task, robot)
-    import_viser()
+    need_library()
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
     console.print("preparing the controllers …")
     playground = Playground(task, controller, ghosts, physics, episode, seed, robot, randomization)
-    viewer = Viewer(port, "ballbot play")
+    from ballbot_train.report.playground import playground_page  # it imports casadi
+
+    viewer = Viewer(port, playground_page(live=True))
     page = PlayPage(playground, viewer)
     signal.signal(signal.SIGTERM, lambda *_: setattr(page, "stopped", True))
     try:

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+from ballbot_gym.engines import default_physics
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter
@@ -62,7 +63,7 @@ def replay(
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
         paths = [Path(entry) for entry in source]
-        shown, name = file_replay(paths), "-".join(file_part(str(path)) for path in paths)
+        shown, name = file_replay(paths), "+".join(file_part(str(path)) for path in paths)
     else:
         _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
         check_names("task", source, TASKS)
@@ -70,8 +71,9 @@ def replay(
         controllers = tuple(all_behind(controllers, filter))
         shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)
         made = file_name(source[0], robot)
-        name = f"{made}-{'-'.join(file_part(controller) for controller in controllers)}-{episode}"
-        name += "-on-" * bool(frictions) + "-".join(f"{friction:g}" for friction in frictions)
+        # parts of names hold no plus, so that no other controllers or floors make the same name
+        name = f"{made}-{'+'.join(file_part(controller) for controller in controllers)}-{episode}"
+        name += "".join(f"+{friction}" for friction in frictions) + f"-{physics}" * (physics != default_physics())
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":

@@ -53,16 +53,18 @@ def robustness(
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
     write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
-        figures.save(figures.robustness_figure(rows, task), out / "figures" / f"robustness-{task}.png")
+        figures.save(
+            figures.robustness_figure(rows, task, facts.get("trained_by", {})),
+            out / "figures" / f"robustness-{task}.png",
+        )
     curves = [
         stressed.curve_of(rows, task, controller, name)
         for task, group in chosen.items()
         for name in stresses
         for controller in group
     ]
-    publish(
-        out, "robustness", f"{episodes} certified episodes per task and severity, physics={physics}", _TABLE, curves
-    )
+    title = f"{episodes} certified episodes per task and severity, physics={physics}"
+    publish(out, "robustness", title, _TABLE, curves, facts)
     console.print(f"curves: {out / 'figures'}")
 
 

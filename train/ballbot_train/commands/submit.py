@@ -23,6 +23,12 @@ def submit(
     packed = submissions.pack(results, name, link, controller)
     # all are verified before one is written, so that a refused one replaces nothing
     entries = [submissions.verify(out / file, content=content) for file, content in packed.items()]
+    for file, content in packed.items():
+        if (out / file).exists() and files.read(out / file) != content:
+            raise submissions.SubmissionError(
+                f"{out / file} is another submission of this name; submit under another --name, give another --out, or "
+                "delete that file"
+            )
     paths = [files.write(out / file, content) for file, content in packed.items()]
     print_entries(entries)
     for path in paths:

@@ -91,5 +91,5 @@ def transfer(
     results = run_groups(groups, episodes, out, workers, seed)
     rows = leaderboard(results, seed)
     write_results("transfer", rows, results, facts, out, _IN_CSV, regret=_REGRET)
-    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows)
+    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows, facts)
     console.print(f"matrix: {out / 'transfer.csv'}")

@@ -2,7 +2,7 @@
 
 A map spans the lean γ and one other component of Stabilize's initial state; the rest is zero. A state is recovered if the
 episode succeeds: at rest at the origin when it ends. It is recoverable if it lies within the boundary that
-`ballbot_baselines.recovery` finds, or if any controller recovers from it. Turning the world by 180° takes (γ, v) to
+`ballbot_baselines.optimum.recovery` finds, or if any controller recovers from it. Turning the world by 180° takes (γ, v) to
 (−γ, −v), so only half of every map is run.
 """
 
@@ -78,7 +78,7 @@ def run(
 
 
 def _boundary(robot: str, names: Sequence[str]) -> Iterator[jobs.Entry]:
-    from ballbot_baselines.recovery import largest_leans  # it imports CasADi
+    from ballbot_baselines.optimum.recovery import largest_leans  # it imports CasADi
 
     for name in names:
         values = grid(name, _BOUNDARY_POINTS)[1]

@@ -6,16 +6,17 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS, FILTERS, VARIANTS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_train.policy import files
 from ballbot_train.policy.files import PolicyError, is_run, read_description, shipped_policies, weights_digest
 from ballbot_train.work.console import check_names, check_some
 
@@ -23,19 +24,26 @@ _SENSORS = "ekf"
 """The filter for robots with wheels: it makes the state from sensors."""
 
 
+def _experts() -> ModuleType:
+    """The package of the experts. It is imported where they are asked for by name: who evaluates a function needs none."""
+    import ballbot_baselines
+
+    return ballbot_baselines
+
+
 def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
     """The controllers that a task has for a robot, experts first; tracks as of `shipped_policies`."""
-    return [*CONTROLLERS, *shipped_policies(task, robot, track)]
+    return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
 def filters(params: BallbotParams) -> tuple[str, ...]:
     """The filters that may stand in front of controllers of a robot."""
-    return tuple(ending[1:] for ending in FILTERS) if params.wheels is None else (_SENSORS,)
+    return tuple(ending[1:] for ending in _experts().FILTERS) if params.wheels is None else (_SENSORS,)
 
 
 def split(name: str) -> tuple[str, str]:
     """A controller's name without its filter, and the filter or "": "shac-adaptive-ekf" is ("shac", "adaptive-ekf")."""
-    ending = next((ending for ending in FILTERS if name.endswith(ending)), "")
+    ending = next((ending for ending in _experts().FILTERS if name.endswith(ending)), "")
     return name.removesuffix(ending), ending[1:]
 
 
@@ -63,7 +71,7 @@ def all_behind(given: Sequence[str], filter: str | None) -> list[str]:
 
 def is_expert(name: str) -> bool:
     """Whether a name is an expert's or a variant's, and no policy's."""
-    return split(name)[0] in CONTROLLERS | VARIANTS
+    return split(name)[0] in _experts().CONTROLLERS | _experts().VARIANTS
 
 
 def is_file(name: str) -> bool:
@@ -84,7 +92,7 @@ def acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
         return is_made_for(name, task, robot)
     alone, filter = split(name)
     fits = not filter or filter in filters(named_robot(robot))
-    return name in VARIANTS or (fits and alone in names(task, robot, None))
+    return name in _experts().VARIANTS or (fits and alone in names(task, robot, None))
 
 
 def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
@@ -124,6 +132,12 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
     return weights_digest(shipped_policies(task, robot, None).get(name, name))
 
 
+def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
+    """Digest of the network of a policy by name or file, as its description says; see `policy.files.network_digest`."""
+    name = split(name)[0]
+    return files.network_digest(shipped_policies(task, robot, None).get(name, name))
+
+
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
     """The task that is named, or the registered one that a policy file names, or stabilize.
 
@@ -154,7 +168,7 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
     shipped = shipped_policies(task, robot, None)
     if name in shipped:
         return shipped[name]
-    if name in CONTROLLERS:
+    if name in _experts().CONTROLLERS:
         raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
     if not is_file(name):
         raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
@@ -186,8 +200,8 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    if name in VARIANTS and params.wheels is None:
-        return VARIANTS[name](task, params)
+    if name in _experts().VARIANTS and params.wheels is None:
+        return _experts().VARIANTS[name](task, params)
     alone, filter = split(name)
     controller = _unfiltered(alone, task, params)
     if getattr(controller, "told", None) is not None:  # it needs an estimate of the robot
@@ -202,14 +216,14 @@ def _filtered(controller: Controller, filter: str | None, task: Task, params: Ba
     if filter not in filters(params):
         known = ", ".join(filters(params))
         raise ValueError(f"unknown filter {filter!r}; controllers of {robot_name(params)} can have {known}")
-    from ballbot_baselines.adaptive import FilteredController  # it imports CasADi
+    from ballbot_baselines.feedback.adaptive import FilteredController  # it imports CasADi
 
     return FilteredController(task, params, f"-{filter}", controller)
 
 
 def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
-    if name in CONTROLLERS | VARIANTS:
-        return (CONTROLLERS | VARIANTS)[name](task, params)
+    if name in _experts().CONTROLLERS | _experts().VARIANTS:
+        return (_experts().CONTROLLERS | _experts().VARIANTS)[name](task, params)
     robot = robot_name(params)
     shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):
@@ -333,8 +347,19 @@ def controllers_by_robot(
 
 def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
     """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
+    return _of_policies(policy_digest, controllers, robot)
+
+
+def network_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
+    """As `policy_digests`, of the networks."""
+    return _of_policies(network_digest, controllers, robot)
+
+
+def _of_policies(
+    digest: Callable[[str, Task, str], str], controllers: Mapping[str, Sequence[str]], robot: str
+) -> dict[str, str]:
     return {
-        f"{task}/{name}": policy_digest(name, make_task(task, robot), robot)
+        f"{task}/{name}": digest(name, make_task(task, robot), robot)
         for task, group in controllers.items()
         for name in group
         if not is_expert(name)

@@ -3,18 +3,22 @@
 Importing this module is light: torch is imported for policy files, CasADi for experts that plan, SciPy for intervals.
 """
 
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.identity import problem_parts
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.controllers import as_controller, behind, policy_digest
+from ballbot_train.evaluation.controllers import as_controller, behind, is_file, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.evaluation.runner import checked_episodes, run_episodes, shown_to
 from ballbot_train.work.console import late_bar
@@ -115,18 +119,26 @@ def evaluate(
         controller = as_controller(policy, env.task, env.params, filter)
         env = shown_to(controller, env)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
-        named = name or behind(_name(policy), filter), name_of(env.task) or type(env.task).__name__.lower()
+        file = str(Path(policy).absolute()) if isinstance(policy, str | Path) and is_file(str(policy)) else ""
+        held = None if out is None else _Held.of(Path(out))
+        on = name_of(env.task) or type(env.task).__name__.lower()
+        named = name or behind(_name(policy, file, on, held), filter), on
         motions: list[recordings.Recording] = []
         with late_bar("episodes", len(indices)) as advance:
             results = run_episodes(env, controller, *named, indices, 0, known, motions, advance)
         row = summarize(results)
-        if out is not None:
+        if out is not None and held is not None:
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
-            facts = provenance() | ran
-            results = [*_kept(Path(out), ran, row), *results]
-            write_leaderboard(leaderboard(results), results, facts, Path(out))
+            digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
+            key, problem = f"{on}/{named[0]}", {on: problem_parts(env.task, env.params)}
+            more = {
+                "problems": problem,
+                "policies": {key: digest} if digest else {},
+                "files": {key: file} if file else {},
+            }
+            results, facts = held.joined(Path(out), ran, more, results)
+            write_leaderboard(leaderboard(results), results, provenance() | facts, Path(out))
             if env.params.wheels is None and not env.randomization.active:
-                digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
                 who = env.physics, named[0], digest
                 recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)
         return row
@@ -134,23 +146,65 @@ def evaluate(
         env.close()
 
 
-def _kept(out: Path, ran: dict[str, Any], row: Row) -> list[Result]:
-    """The results in a folder that stay when a row is written there: those of other tasks and controllers.
+@dataclass(frozen=True)
+class _Held:
+    """What a folder of results holds before a row is added: its facts, and its episodes."""
 
-    Raises:
-        ValueError: they are of another engine, robot or randomization, or damaged.
-    """
-    if not (out / "leaderboard.json").exists():
-        return []
-    from ballbot_train.work import jobs  # it needs the library of locks
+    about: Mapping[str, Any]
+    results: Sequence[Result]
 
-    about, results = read_results(out)
-    jobs.check_same({key: about.get(key) for key in ran}, ran, out, "results")
-    return [result for result in results if (result.task, result.controller) != (row.task, row.controller)]
+    @classmethod
+    def of(cls, out: Path) -> "_Held":
+        return cls(*(read_results(out) if (out / "leaderboard.json").exists() else ({}, [])))
+
+    def file(self, task: str, name: str) -> str | None:
+        """The policy file of a row; None where there is no such row, or nobody knows its file."""
+        return self.about.get("files", {}).get(f"{task}/{name}")
+
+    def joined(
+        self, out: Path, ran: dict[str, Any], more: dict[str, dict[str, Any]], new: Sequence[Result]
+    ) -> tuple[list[Result], dict[str, Any]]:
+        """The results with those of a new row, and the facts of all of them. A row of the same policy is replaced.
+
+        Args:
+            out: the folder.
+            ran: facts that are the same for all rows.
+            more: facts by task, or by task and name, of the new row.
+            new: the episodes of the new row.
+
+        Raises:
+            ValueError: the folder is of another engine, robot or randomization; of another problem of this name; or a row
+                of another policy has this name.
+        """
+        task, name = new[0].task, new[0].controller
+        if self.results:
+            from ballbot_train.work import jobs  # it needs the library of locks
+
+            jobs.check_same({key: self.about.get(key) for key in ran}, ran, out, "results")
+            problems = {key: value for key, value in self.about.get("problems", {}).items() if key == task}
+            jobs.check_same({"problems": problems}, {"problems": more["problems"] if problems else {}}, out, "results")
+        row = [result for result in self.results if (result.task, result.controller) == (task, name)]
+        costs = {result.episode: result.cost for result in row}
+        held, file = self.file(task, name), more["files"].get(f"{task}/{name}")
+        same = all(math.isclose(each.cost, costs.get(each.episode, each.cost), rel_tol=1e-6) for each in new)
+        if row and not (held == file if held and file else same):
+            raise ValueError(
+                f"{out} holds a row {name!r} on {task} of another policy, or of this one as it was; give this one another "
+                "name, or another out"
+            )
+        facts = {key: {**self.about.get(key, {}), **value} for key, value in more.items()}
+        return [*(result for result in self.results if result not in row), *new], ran | facts
 
 
-def _name(policy: Any) -> str:
-    if isinstance(policy, str | Path):
-        path = Path(policy)
-        return f"{path.parent.name}/{path.name}" if path.parent.name else path.name  # a run's folder tells its policy
-    return getattr(policy, "__name__", type(policy).__name__.lower())
+def _name(policy: Any, file: str, task: str, held: _Held | None) -> str:
+    """The policy's own name: of a file the folder and the file, and folders above where a row of another file has that."""
+    if not isinstance(policy, str | Path):
+        return getattr(policy, "__name__", type(policy).__name__.lower())
+    if not file:
+        return str(policy)
+    parts = Path(policy).absolute().parts if len(Path(policy).parts) > 1 else Path(policy).parts
+    names = [
+        str(Path(*parts[-n:])) for n in range(min(2, len(parts)), len(parts) + 1)
+    ]  # a run's folder tells its policy
+    free = (name for name in names if held is None or held.file(task, name) in (None, file))
+    return next(free, names[-1])

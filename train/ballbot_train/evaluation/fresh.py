@@ -398,7 +398,7 @@ def find_optima(
 
 
 def _optimal_cost(*problem: Any) -> float:
-    from ballbot_baselines.certification import optimum_of  # it imports CasADi
+    from ballbot_baselines.optimum.certification import optimum_of  # it imports CasADi
 
     try:
         return optimum_of(*problem).cost

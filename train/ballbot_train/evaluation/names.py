@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from ballbot_gym.engines import PHYSICS
@@ -11,6 +11,8 @@ from ballbot_gym.robots import ROBOTS
 
 _PLAIN = re.compile("[a-z0-9]+(-[a-z0-9]+)*")
 _DIGEST = 12  # hexadecimal digits
+ARROW = " → "
+"""Between the learners of a policy's way."""
 _LONGEST = 60  # characters of a name that a file's name repeats
 
 
@@ -33,6 +35,22 @@ def file_part(name: str) -> str:
     path = Path(name)
     readable = re.sub("[^a-z0-9]+", "-", f"{path.parent.name}-{path.stem}".lower()).strip("-")[:_LONGEST]
     return f"{readable}-{digest(name)[:_DIGEST]}".strip("-")
+
+
+def with_way(name: str, way: str) -> str:
+    """A controller's name behind the learners that came before it on the way of its training: "dagger → shac → ppo".
+
+    Args:
+        name: of a shipped policy, as "ppo" or "shac-late", or anything else, which stays as it is where there is no way.
+        way: its whole way, as `policy_files.way_of` tells it.
+    """
+    before, arrow, _ = way.rpartition(ARROW)
+    return f"{before}{arrow}{name}" if not Path(name).suffix else name
+
+
+def ways_on(ways: Mapping[str, str], task: str) -> dict[str, str]:
+    """The ways of a task's policies by their names, of ways by "TASK/NAME"."""
+    return {key.partition("/")[2]: way for key, way in ways.items() if key.startswith(f"{task}/")}
 
 
 def shortened(names: Iterable[str]) -> dict[str, str]:

@@ -102,7 +102,7 @@ def compute(
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as advance:
-            from ballbot_baselines.certification import AT_ONCE, entries
+            from ballbot_baselines.optimum.certification import AT_ONCE, entries
 
             solve = partial(entries, task, robot=params, randomization=randomization)
             each = min(AT_ONCE, -(-len(missing) // _TASKS))

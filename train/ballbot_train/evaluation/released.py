@@ -4,6 +4,7 @@
 and the name of its file. So a row that was edited, added or removed by hand is found.
 """
 
+import hashlib
 from dataclasses import asdict
 from pathlib import Path
 
@@ -48,12 +49,21 @@ def read_released(folder: Path = LEADERBOARD) -> dict[str, str]:
     return listed
 
 
-def unbacked(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> list[str]:
+def unbacked(
+    folder: Path = LEADERBOARD, episodes: int = certified.EPISODES, downloaded: Path | None = None
+) -> list[str]:
     """What is wrong with a leaderboard's rows, one sentence each; empty where every row is backed.
 
-    A submission that lies beside its row is verified anew, which takes seconds.
+    A submission that lies beside its row is verified again, which takes seconds.
+
+    Args:
+        folder: of the rows.
+        episodes: of each row.
+        downloaded: folder with the submissions of releases. If it is given, the list of released rows decides nothing: each
+            row needs its submission, whose SHA-256 the row holds, and it is verified again.
     """
     entries, released = read_entries(folder), read_released(folder)
+    found_in = {} if downloaded is None else {_sha256(path): path for path in sorted(downloaded.rglob("*.npz"))}
     found = {path.name for path in folder.glob("*.json")}
     wrong = [f"{name}: the row is missing, and {LIST} has it" for name in released.keys() - found]
     wrong += [
@@ -62,7 +72,9 @@ def unbacked(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> 
         if path.with_suffix(".json").name not in found
     ]
     for entry in entries:
-        if why := _unbacked(entry, folder, released, episodes):
+        submission = (folder / entry.file).with_suffix(".npz")
+        submission = submission if submission.exists() else found_in.get(entry.submission)
+        if why := _unbacked(entry, submission, released if downloaded is None else {}, episodes):
             wrong.append(f"{entry.file}: {why}")
     misnamed = found - {entry.file for entry in entries}
     return wrong + [f"{name}: the name of the file is not that of its row" for name in sorted(misnamed)]
@@ -82,22 +94,25 @@ def release(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> P
     return files.write(folder / LIST, "".join(f"{of}  {file}\n" for file, of in sorted(listed.items())))
 
 
-def _unbacked(entry: Entry, folder: Path, released: dict[str, str], episodes: int) -> str:
-    """Why a row is not accepted; "" if it is."""
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(files.read(path)).hexdigest()
+
+
+def _unbacked(entry: Entry, submission: Path | None, released: dict[str, str], episodes: int) -> str:
+    """Why a row is not accepted; "" if it is. Its submission is verified again, if there is one."""
     if len(entry.costs) != episodes:
         return f"it has {len(entry.costs)} episodes, and not {episodes}"
     if any(getattr(entry, name) != value for name, value in summary(entry).items()):
         return "its success, falls or regret are not those of its episodes"
     if why := too_good(entry):
         return why
-    submission = (folder / entry.file).with_suffix(".npz")
-    if submission.exists():
+    if submission is not None:
         try:
             verified = verify(submission, episodes)
         except ValueError as error:
             return str(error)
-        again = f"ballbot verify {submission.name} --write {folder.name}"
-        return "" if verified == entry else f"the submission beside it gives another row; {again}"
+        again = f"ballbot verify {submission} --write {LEADERBOARD.name}"
+        return "" if verified == entry else f"its submission gives another row; {again}"
     if entry.file not in released:
-        return f"no submission lies beside it, and {LIST} does not have it"
+        return f"no submission lies beside it or was downloaded, and no {LIST} that counts has it"
     return "" if released[entry.file] == digest_of(entry) else f"it is not the row that {LIST} has"

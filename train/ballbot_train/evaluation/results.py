@@ -12,7 +12,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.certified import version
 from ballbot_gym.display import Displayed, percent
-from ballbot_train.evaluation.names import shortened
+from ballbot_train.evaluation.names import shortened, with_way
 from ballbot_train.evaluation.statistics import interval
 
 
@@ -250,12 +250,20 @@ def cells(row: Row) -> list[str]:
     return [text(row) for text in TABLE.values()]
 
 
-def table_cells(shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any]) -> list[list[str]]:
-    """Rows as text, under the headers of what is `shown` of each. Paths of policies are as short as tells them apart."""
+def table_cells(
+    shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any], ways: Mapping[str, str] = {}
+) -> list[list[str]]:
+    """Rows as text, under the headers of what is `shown` of each. Paths of policies are as short as tells them apart.
+
+    `ways` are the whole ways of shipped policies by "TASK/NAME", as of `benchmark.open_run`.
+    """
     table = [[text(row) for text in shown.values()] for row in rows]
     if "controller" in shown:
         place = list(shown).index("controller")
         short = shortened(line[place] for line in table)
-        for line in table:
-            line[place] = short[line[place]]
+        for row, line in zip(rows, table, strict=True):
+            told, key = getattr(row, "told", {}), f"{shown['task'](row)}/{line[place]}"
+            if "made_for" in told and told["made_for"] != told["robot"]:
+                key = f"{told['made_for']}/{key}"
+            line[place] = with_way(short[line[place]], ways.get(key, ""))
     return table

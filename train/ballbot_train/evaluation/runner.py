@@ -20,7 +20,7 @@ import numpy as np
 from ballbot_gym import certified, files, seeding
 from ballbot_gym.certified import version
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.identity import named_problem_digest
+from ballbot_gym.identity import named_problem
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
@@ -65,18 +65,21 @@ def open_run(
             process is using it; or the seed is negative.
     """
     check_least(0, seed=settings.get("seed", 0))
-    policies = {
-        name if made_for == robot else f"{made_for}/{name}": digest
-        for made_for, by_task in chosen.items()
-        for name, digest in registry.policy_digests(by_task, made_for).items()
-    }
+    policies, networks = (
+        {
+            name if made_for == robot else f"{made_for}/{name}": found
+            for made_for, by_task in chosen.items()
+            for name, found in digests(by_task, made_for).items()
+        }
+        for digests in (registry.policy_digests, registry.network_digests)
+    )
     problems = {
-        task if name == robot else f"{name}/{task}": named_problem_digest(task, name)
+        task if name == robot else f"{name}/{task}": named_problem(task, name)
         for made_for, by_task in chosen.items()
         for task in by_task
         for name in (robot, made_for)
     }
-    settings |= robot_setting(robot) | {"policies": policies, "problems": problems}
+    settings |= robot_setting(robot) | {"policies": policies, "networks": networks, "problems": problems}
     settings["controllers"] = chosen
     for path in (out / f"{name}.json" for name in _TABLES):
         if path.exists():
@@ -91,9 +94,19 @@ def open_run(
     return facts
 
 
-def publish(out: Path, name: str, title: str, shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any]) -> None:
-    """Ends a run: writes its table as NAME.md, and prints it. It has what is `shown` of each row, by header."""
-    header, table = list(shown), table_cells(shown, rows)
+def publish(
+    out: Path,
+    name: str,
+    title: str,
+    shown: Mapping[str, Callable[[Any], str]],
+    rows: Sequence[Any],
+    facts: Mapping[str, Any] = {},
+) -> None:
+    """Ends a run: writes its table as NAME.md, and prints it. It has what is `shown` of each row, by header.
+
+    `facts` are those of `open_run`, by which shipped policies are called by the whole way of their training.
+    """
+    header, table = list(shown), table_cells(shown, rows, facts.get("trained_by", {}))
     files.write(out / f"{name}.md", markdown(header, table))
     jobs.release(out)
     print_table(title, header, table)

@@ -2,13 +2,14 @@
 
 Each control step of a recording may miss the engine's by a small tolerance. One error does nothing, but a whole episode of
 errors that all lower the cost would do the work of a force. So for each recorded motion we compute the costate: by how much
-the episode's cost rises per unit of the state. Costate times error is what an error changed in the cost.
+the episode's cost rises per unit of the state. Costate times error is what an error changed in the cost. The multipliers of
+limits that bind, such as the clearance of an obstacle, are not part of it: a motion alone does not tell them.
 """
 
 import numpy as np
 
-from ballbot_baselines.linearize import cost_slopes, discretize
-from ballbot_baselines.lqr import lqr_at_end, tracking_gains
+from ballbot_baselines.solvers.linearize import cost_slopes, discretize
+from ballbot_baselines.solvers.riccati import lqr_at_end, tracking_gains
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 

@@ -7,7 +7,7 @@ import torch
 from torch.optim.swa_utils import AveragedModel
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot, robot_name
+from ballbot_gym.robots import PAPER, named_robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.fitting import start_as_lqr
@@ -80,7 +80,7 @@ def actor_for(
     task: Task, params: BallbotParams, config: Any, history: int, informed: bool, start: PolicyNetwork | None
 ) -> PolicyNetwork:
     """A policy to train, of the config's symmetry and hidden layers, that starts as LQR; or `start` as `started` makes it."""
-    spec = spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params), informed)
+    spec = spec_for(task, config.symmetry, config.hidden, True, history, registered_name(params), informed)
     if start is not None:
         return started(start, spec)
     made = PolicyNetwork(spec)

@@ -9,10 +9,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate
+from ballbot_train.policy.saved_models import mark
 
 BEST_MODEL, BEST_STATISTICS = "best_model.zip", "best_model.vecnormalize.pkl"
 
@@ -66,6 +67,9 @@ class RegretCallback(BaseCallback):
     def evaluate(self) -> dict[str, float]:
         """Measures the present model; returns the figures by name. Raises a PolicyError if it acts in other spaces."""
         return score_and_validate(self.model, self.task, self._robot, self.validation_episodes)
+
+    def _init_callback(self) -> None:
+        mark(self.model.observation_space, self.task, named_robot(self._robot))
 
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq == 0:

@@ -334,7 +334,7 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) ->
     Raises:
         ValueError: no optimum was found.
     """
-    from ballbot_baselines.optimum import Backoff, find_optimum  # it imports CasADi
+    from ballbot_baselines import Backoff, find_optimum  # it imports CasADi
 
     console.print(f"finding {count} optima on which training episodes begin")
     found, backoff = [], Backoff(goal=_RESERVE)

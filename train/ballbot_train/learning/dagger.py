@@ -12,6 +12,7 @@ as regret is.
 On a track the expert knows each episode's robot, and the learner sees what it sees.
 """
 
+import contextlib
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,17 +22,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_baselines import batched
-from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.trajopt import EXECUTED
-from ballbot_baselines.tvlqr import tube_gains
+from ballbot_baselines import Backoff, Optimum, find_optima, find_optimum
+from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import sides_passed
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import robot_name
+from ballbot_gym.robots import registered_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -98,6 +97,42 @@ _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
 
 
+@dataclass(frozen=True)
+class _Optima:
+    """Optima of B episodes of at most n control steps as arrays.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | costs | (B,) | NaN where none was found |
+    | solved | (B,) bool | whether one was found |
+    | steps | (B,) | control steps, fewer than n where a goal is reached |
+    | states | (B, n+1, 8) | after its end an episode's last state is repeated |
+    | forces | (B, n, 2) | N |
+    | gains | (B, n, 2, 8) | as in `Optimum` |
+    """
+
+    costs: np.ndarray
+    solved: np.ndarray
+    steps: np.ndarray
+    states: np.ndarray
+    forces: np.ndarray
+    gains: np.ndarray
+
+    @classmethod
+    def none(cls, count: int, n: int, states: int, forces: int) -> "_Optima":
+        """Of `count` episodes, none of them solved."""
+        x, u, k = np.zeros((count, n + 1, states)), np.zeros((count, n, forces)), np.zeros((count, n, forces, states))
+        return cls(np.full(count, np.nan), np.zeros(count, bool), np.full(count, n), x, u, k)
+
+    def put(self, i: int, optimum: Optimum | None) -> None:
+        """Sets the optimum of one episode, if it was found."""
+        if optimum is not None and optimum.is_optimal:
+            plan, n = optimum.trajectory, len(optimum.trajectory.u)
+            self.costs[i], self.solved[i], self.steps[i] = optimum.cost, True, n
+            self.states[i] = plan.x[np.minimum(np.arange(self.states.shape[1]), n)]
+            self.forces[i, :n], self.gains[i, :n] = plan.u, optimum.gains
+
+
 class Dagger:
     """The learner; see `training.Learner`. An iteration's random numbers depend on seed and iteration alone."""
 
@@ -113,7 +148,7 @@ class Dagger:
         history: int = 0,
     ):
         """As of `Algorithm.make`. Demonstrations are its first samples."""
-        on_track, robot = randomization is not None or history > 0, robot_name(params)
+        on_track, robot = randomization is not None or history > 0, registered_name(params)
         samples = _first_samples(demos, task, robot, config, on_track)
         self.config, self.iteration, self._warm = config, 0, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
@@ -195,8 +230,8 @@ class Dagger:
         state: BatchState,
         robots: Sequence[BallbotParams],
         rng: np.random.Generator,
-        before: tuple[batched.BatchOptima, np.ndarray] | None = None,
-    ) -> tuple[list[BatchState], np.ndarray, batched.BatchOptima]:
+        before: tuple[_Optima, np.ndarray] | None = None,
+    ) -> tuple[list[BatchState], np.ndarray, _Optima]:
         """Runs B episodes from a state under expert or learner, and labels what is seen near the optimum of each.
 
         Args:
@@ -213,7 +248,8 @@ class Dagger:
             others = np.flatnonzero(~self._passes(optima, c, sides))
             for i in rng.permutation(others)[:_MOST_ALONE].tolist() if len(others) else ():
                 path = task.routed_path(x[i], c[i], sides[i])
-                _find_alone(optima, i, task, robots[i], x[i], c[i], self.config.backoff, [path])
+                with contextlib.suppress(PlanError):
+                    optima.put(i, find_optimum(task, robots[i], x[i], c[i], self.config.backoff, paths=[path]))
         usable, costs = optima.solved & self._passes(optima, c, sides), optima.costs
         if before is not None:
             costs = np.where(before[0].solved, before[0].costs, costs)
@@ -241,9 +277,7 @@ class Dagger:
         self._samples.add(Samples.of(torch.cat(seen).numpy(), np.concatenate(labels), np.concatenate(weights)))
         return states, lasted, optima
 
-    def _labels(
-        self, optima: batched.BatchOptima, x: np.ndarray, k: int, limits: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _labels(self, optima: _Optima, x: np.ndarray, k: int, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The optimal actions (B, 2) in states x (B, 8) about control step k, and whether each state is near its optimum.
 
         A policy does not know the time. So what counts is the nearest state of the optimum, which may be some steps away.
@@ -257,14 +291,17 @@ class Dagger:
         near = (np.abs(change) < _SMALL * limits).all(1) & np.isfinite(distances.min(1))
         return np.clip((optima.forces[rows, at] + change) / limits, -1, 1), near
 
-    def _optima_of(self, robots: Sequence[BallbotParams], x: np.ndarray, c: np.ndarray) -> batched.BatchOptima:
+    def _optima_of(self, robots: Sequence[BallbotParams], x: np.ndarray, c: np.ndarray) -> _Optima:
         """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours."""
-        task, backoff, found = self._task, self.config.backoff, []
+        found: list[Optimum | None] = []
         for robot, rows in itertools.groupby(range(len(robots)), robots.__getitem__):
             of = list(rows)
-            find = batched.find_optima if batched.solves(task, robot) else _found_one_by_one
-            found.append(vars(find(task, robot, x[of], c[of], backoff=backoff)))
-        return batched.BatchOptima(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
+            few: dict[str, int] = {} if robot.wheels is None else {"guesses": 1}  # each takes seconds
+            found += find_optima(self._task, robot, x[of], c[of], self.config.backoff, **few)
+        optima = _Optima.none(len(x), self._task.steps, x.shape[1], robots[0].action_size)
+        for i, optimum in enumerate(found):
+            optima.put(i, optimum)
+        return optima
 
     def _sides(self, observation: torch.Tensor) -> list[tuple[int, ...]]:
         """On which sides the learner's routes pass the obstacles of B episodes; for each none, if it has no routes."""
@@ -272,7 +309,7 @@ class Dagger:
             return [()] * len(observation)
         return [tuple(sides) for sides in self.network.routes(observation).int().tolist()]
 
-    def _passes(self, optima: batched.BatchOptima, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> np.ndarray:
+    def _passes(self, optima: _Optima, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> np.ndarray:
         """(B,) whether optima pass the obstacles ahead of their beginnings on these sides."""
         passes = np.ones(len(c), bool)
         for i, wanted in enumerate(sides):
@@ -293,7 +330,7 @@ class Dagger:
         return torch.stack(x, 1).double().numpy()
 
 
-def _goes_on(optima: batched.BatchOptima, before: batched.BatchOptima, at: np.ndarray) -> np.ndarray:
+def _goes_on(optima: _Optima, before: _Optima, at: np.ndarray) -> np.ndarray:
     """(B,) whether optima go where earlier ones, which began `at` (B,) control steps ago, went on to go, if there were any.
 
     Where two ways cost about the same, a policy that changes its mind under way takes neither.
@@ -301,39 +338,6 @@ def _goes_on(optima: batched.BatchOptima, before: batched.BatchOptima, at: np.nd
     n = optima.states.shape[1]
     then = before.states[np.arange(len(at))[:, None], np.minimum(at[:, None] + np.arange(n), n - 1)]
     return (np.abs(optima.states - then)[..., :2].max((1, 2)) < _SAME_WAY) | ~before.solved
-
-
-def _found_one_by_one(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff
-) -> batched.BatchOptima:
-    """As `batched.find_optima`, of tasks and robots that it does not solve. There are no slopes."""
-    optima = batched.BatchOptima.empty(len(x0), task.steps, params.state_size, params.action_size)
-    for i in range(len(x0)):
-        _find_alone(optima, i, task, params, x0[i], c[i], backoff)
-    return optima
-
-
-def _find_alone(
-    optima: batched.BatchOptima,
-    i: int,
-    task: Task,
-    params: BallbotParams,
-    x0: np.ndarray,
-    c: np.ndarray,
-    backoff: Backoff,
-    paths: list[np.ndarray] | None = None,
-) -> None:
-    """Puts the optimum of one episode, from ground paths or from the task's, in its place."""
-    fewer: dict[str, Any] = {} if params.wheels is None else {"guesses": 1}  # each takes seconds
-    try:
-        found = find_optimum(task, params, x0, c, backoff, paths=paths, **fewer)
-    except PlanError:
-        return
-    plan, n = found.trajectory, len(found.trajectory.u)
-    if found.is_optimal:
-        optima.costs[i], optima.solved[i], optima.steps[i] = found.cost, True, n
-        optima.states[i] = plan.x[np.minimum(np.arange(task.steps + 1), n)]
-        optima.forces[i, :n], optima.gains[i, :n] = plan.u, tube_gains(task, params, plan, c)
 
 
 def _first_samples(

@@ -12,12 +12,13 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.checks import LARGEST
-from ballbot_gym.identity import problem_digest
+from ballbot_gym.identity import problem_parts
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train.policy.files import OBSERVATION_VERSION
 from ballbot_train.work import shards
 from ballbot_train.work.console import option
+from ballbot_train.work.jobs import check_same
 
 IN_DATASET = {
     "observations": "observations",
@@ -102,12 +103,9 @@ def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task, robot: s
     # learners know their robot by `robot_name`, which is another where only the friction is
     if robot not in (shown, robot_name(named_robot(shown)) if shown in ROBOTS else shown):
         raise ValueError(f"{path} holds demonstrations of the robot {shown}, not of {robot}; make others with --robot")
-    problem = problem_digest(task, named_robot(shown)) if shown in ROBOTS else None
-    if problem is not None and metadata.get("problem", problem) != problem:  # older ones have no digest
-        raise ValueError(
-            f"{path} holds demonstrations of another problem of this name: its episodes, costs, limits, observations or "
-            'robot have changed since; make it again with "ballbot demos"'
-        )
+    if shown in ROBOTS and "problem" in metadata:  # older ones have no digest
+        wanted = {"problem": problem_parts(task, named_robot(shown))}
+        check_same({"problem": metadata["problem"]}, wanted, Path(path), "demonstrations")
     if metadata.get("observation_version") != OBSERVATION_VERSION:
         raise ValueError(
             f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "

@@ -37,13 +37,12 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 
-from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.optimum import Backoff
-from ballbot_baselines.trajopt import EXECUTED
+from ballbot_baselines import CONTROLLERS, Backoff
+from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.identity import named_problem_digest
+from ballbot_gym.identity import digest, named_problem
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import PlanError
@@ -201,6 +200,17 @@ def record(
     return {name: np.array(values) for name, values in made.items()}, info
 
 
+def _content(config: DemoConfig) -> dict[str, Any]:
+    """What decides a dataset behind the names that its settings give."""
+    task, content = make_task(config.task, config.robot), {"problem": named_problem(config.task, config.robot)}
+    if controllers.is_expert(config.expert):
+        return content
+    weights, network = (
+        of(config.expert, task, config.robot) for of in (controllers.policy_digest, controllers.network_digest)
+    )
+    return content | {"expert_policy": digest(weights, network)}
+
+
 def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
     """Makes a dataset in parallel processes. A killed run continues when it is started again.
 
@@ -221,12 +231,12 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
         parse_dataset_id(out.name)
     except (ValueError, TypeError):
         raise ValueError(f"a dataset's folder is named NAME-vNUMBER, as stabilize-trajopt-v0, not {out.name}") from None
-    described = asdict(config) | {"problem": named_problem_digest(config.task, config.robot)}
+    described = asdict(config) | _content(config)
     unfinished = out.with_name(f".{out.name}.unfinished")
     if out.exists():
         metadata = metadata_of(out)
         # older ones have no digest
-        held = metadata["demos"] | {"problem": metadata.get("problem", described["problem"])}
+        held = metadata["demos"] | {name: metadata.get(name, described[name]) for name in _content(config)}
         jobs.check_same(held, described, out, "a dataset")
         shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
         return out
@@ -252,7 +262,7 @@ def write_shards(
 
     Args:
         config: settings of the dataset. Its number of episodes may grow later.
-        url: folder of the set, on this machine or on any storage that fsspec knows.
+        url: folder of the set, on this machine or on storage, see `shards`.
         out: folder of this machine for what is unfinished.
         workers: a number of processes, or `Workers`.
         per_shard: episodes of a shard.
@@ -266,7 +276,7 @@ def write_shards(
         "demos": described,
         "task": repr(make_task(config.task, config.robot)),
         "observation_version": OBSERVATION_VERSION,
-        "problem": named_problem_digest(config.task, config.robot),
+        **_content(config),
     }
     named = f"{config.task} {config.expert}"
     return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, named, per_shard)
@@ -333,7 +343,7 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
             "task": repr(task),
             "observation_version": OBSERVATION_VERSION,
             "demos": asdict(config),
-            "problem": named_problem_digest(config.task, config.robot),
+            **_content(config),
         }
     )
     (root / out.name).rename(out)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_baselines.lqr import equilibrium_gain
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning.state import load_state, state_of

@@ -18,7 +18,7 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import robot_name
+from ballbot_gym.robots import registered_name
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
@@ -222,11 +222,13 @@ class Ppo(ModelFree):
             raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")
         if config.backwards and config.relative_advantages:
             raise ValueError("backwards shapes rewards, which tell no cost to go: give --no-relative-advantages too")
-        spec = spec_for(task, config.symmetry, config.hidden, history=world.get("history", 0))
+        spec = spec_for(
+            task, config.symmetry, config.hidden, history=world.get("history", 0), robot=registered_name(params)
+        )
         if start is not None:
             start = started(start, spec)
             spec = start.spec
-        given = None if demos is None else load_demos(demos, task, robot_name(params))
+        given = None if demos is None else load_demos(demos, task, spec.robot)
         super().__init__(task, params, config, given, warm, backwards=config.backwards, **world)
         self.config = config
         model = PPO(

@@ -1,7 +1,7 @@
 """Teaches a policy's `Routes` which sides are cheapest: what every choice costs is predicted, for thousands of drawn slaloms.
 
-`ballbot_baselines.sides` predicts the costs from the motion without obstacles, which depends on the goal's distance alone. So
-no optimum of a slalom is searched for this.
+`ballbot_baselines.optimum.sides` predicts the costs from the motion without obstacles, which depends on the distance to the
+goal alone. So no optimum of a slalom is searched for this.
 """
 
 import math
@@ -10,8 +10,8 @@ from typing import cast
 import numpy as np
 import torch
 
-from ballbot_baselines import sides
-from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines import find_optimum
+from ballbot_baselines.optimum import sides
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES

@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSample
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import robot_name
+from ballbot_gym.robots import registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_train.learning.actors import spec_for, started
@@ -260,13 +260,13 @@ class Sac(ModelFree):
         """As of `Algorithm.make`. Demonstrations are kept beside its own steps, and a policy must be one of SAC's."""
         if demos is not None and config.n_steps > 1:
             raise ValueError("n_steps must be 1 with demonstrations, which are single steps")
-        spec = spec_for(task, config.symmetry, config.hidden)
+        spec = spec_for(task, config.symmetry, config.hidden, robot=registered_name(params))
         frame = spec.seen_in
         spec = replace(spec, activation="silu", squash="tanh" if frame is None else "tanh_in_frame")
         start = None if start is None else started(start, spec)
         if start is not None and start.spec != spec:
             raise ValueError(f"a policy of {start.spec} cannot start one of {spec}; give --hidden or --symmetry")
-        given = None if demos is None else load_demos(demos, task, robot_name(params))
+        given = None if demos is None else load_demos(demos, task, spec.robot)
         if given is not None and task.first_exit:
             given = given.without_pay(task, FAILURE_PRICE)
         if given is not None and frame is not None:

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ballbot_gym.seeding import spawned
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_train.policy.saved_models import mark
 
 
 class BallbotVecEnv(VecEnv):
@@ -48,6 +49,8 @@ class BallbotVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, np.int64)
         self._made = time.time()
         self._actions: np.ndarray | None = None
+        if env.observation == "state":
+            mark(env.single_observation_space, env.task, env.params)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self.metadata = (
             env.metadata | self.metadata

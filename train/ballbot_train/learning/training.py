@@ -50,7 +50,7 @@ from ballbot_gym import certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.identity import digest, problem_digest
+from ballbot_gym.identity import digest, problem_parts
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
@@ -58,7 +58,7 @@ from ballbot_train.evaluation import evaluate, fresh, runner
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
-from ballbot_train.policy.files import weights_digest
+from ballbot_train.policy.files import content_digest
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 from ballbot_train.policy.weights import own_defaults, saved_by_torch
 from ballbot_train.work import jobs
@@ -194,13 +194,15 @@ def train(
         if getattr(learner, name) < 1:
             raise ValueError(f"{name} must be at least 1, not {getattr(learner, name)}")
     run = _Run(learner, task, config, out)
+    if (trained := learner.network.spec.robot) != run.robot:
+        raise ValueError(f'the learner trains {trained!r}, and "robot" of config is {run.robot!r}; give both the same')
     if (out / _CONFIG).exists() and not resume:
         raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
     # a command names the folder, which may have been moved or copied, and every setting is compared without it
     compared = {name: value for name, value in config.items() if name != "command"}
-    compared["problem"] = problem_digest(task, named_robot(run.robot))
+    compared["problem"] = problem_parts(task, named_robot(run.robot))
     if config.get("start") is not None:
-        compared["start_weights"] = weights_digest(config["start"])
+        compared["start_policy"] = content_digest(config["start"])
     if config.get("demos") is not None:
         compared["demonstrations"] = digest(metadata_of(config["demos"]))
     jobs.claim(out, compared, _CONFIG, {"command": config.get("command"), "about": provenance()})
@@ -373,9 +375,14 @@ def _interruptible() -> Iterator[Any]:
         if pressed:
             raise KeyboardInterrupt
         pressed.append(number)
-        console.print("saving; press Ctrl-C again to stop at once")
+        again = "press Ctrl-C again" if number == signal.SIGINT else "send the signal again"
+        console.print(f"saving; {again} to stop at once")
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    # of a program in which Python is embedded we could not restore the handler
+    before = {number: handler for number, handler in handlers.items() if handler is not None}
+    for number in before:
+        signal.signal(number, on_signal)
     try:
         yield lambda: bool(pressed)
     finally:

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import kalman
-from ballbot_baselines.adaptive import FilteredController
-from ballbot_baselines.lqr import equilibrium_gain
+from ballbot_baselines.feedback.adaptive import FilteredController
+from ballbot_baselines.feedback.kalman import SensorFilter
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import dynamics, files, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.lazy import imports_of
@@ -62,7 +62,7 @@ def export_c(
         path: of the C file.
         task: what the policy was made for.
         robot: by name.
-        filtered: with `kalman.SensorFilter` in front of it, which makes the state from sensors.
+        filtered: with `SensorFilter` in front of it, which makes the state from sensors.
         prefix: of all names that the file shows to others, so that one program can hold several controllers.
 
     Raises:
@@ -124,24 +124,24 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
 
 
 def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:
-    """What the template needs of `kalman.SensorFilter`."""
+    """What the template needs of `SensorFilter`."""
     if task.constant_names:
         raise ValueError(
             f"where {task.id} starts depends on the episode, so no C file can hold the filter; leave out -ekf"
         )
-    model = kalman.robot_and_sensors(params)
+    sensor_filter = SensorFilter(task, params)
 
     def robot(x: casadi.SX, u: casadi.SX) -> casadi.SX:
-        found, slopes = model(x, u)
+        found, slopes = sensor_filter.model(x, u)
         return casadi.vertcat(found, casadi.vec(slopes.T))
 
-    start, deviations = kalman.expected_start(task, params, np.zeros(0))
+    start, deviations = sensor_filter.expected_start(np.zeros(0))
     return {
         "substeps": dynamics.substeps_for(task.control_dt),
         "start": start,
         "start_variance": deviations**2,
-        "model_variance": kalman.WHEELS_ERROR,
-        "reading_variance": kalman.readings_variance(task.control_dt),
+        "model_variance": sensor_filter.model_variance,
+        "reading_variance": sensor_filter.reading_variance,
         "model": c_function("robot", robot, {"x": params.state_size, "u": params.action_size}, "double"),
     }
 

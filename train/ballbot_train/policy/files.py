@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
-from ballbot_gym.identity import observation_digest
+from ballbot_gym.identity import digest, observation_digest
 from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS
 from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
@@ -255,6 +255,16 @@ def weights_digest(path: str | Path) -> str:
         return hashlib.sha256(files.read(weights)).hexdigest()
     except files.FileError as error:
         raise PolicyError(f"{weights} is not a policy: {error}") from error
+
+
+def content_digest(path: str | Path) -> str:
+    """Digest of what a policy does: its weights, and the network that its description says."""
+    return digest(weights_digest(path), network_digest(path))
+
+
+def network_digest(path: str | Path) -> str:
+    """Digest of the network that a policy's JSON file describes; "" of a saved model, whose only file has the weights too."""
+    return "" if Path(path).suffix == ".zip" else digest(read_description(path)["spec"])
 
 
 def is_run(path: Path) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ballbot_gym import files
+from ballbot_gym.identity import observation_digest
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.sensors import observation_space
@@ -28,6 +29,7 @@ _ACTIVATIONS = ("ELU", "GELU", "LeakyReLU", "ReLU", "SELU", "SiLU", "Tanh")
 _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here
 _ON_POLICY, _OFF_POLICY = ("mlp_extractor.policy_net.", "action_net."), ("actor.latent_pi.", "actor.mu.")
 """How the names of actors' layers begin."""
+_MARK = "ballbot_observation_digest"
 _DATA_LIMIT = 2**24  # bytes of JSON
 
 
@@ -64,15 +66,31 @@ class SavedActor(torch.nn.Module):
         return torch.tanh(action) if self._squashed else action.clamp(-1.0, 1.0)
 
 
+def mark(space: spaces.Space, task: Task, params: BallbotParams) -> None:
+    """Adds the digest of a task's observations to the space that models are trained in: their files keep what is added.
+
+    `BallbotVecEnv` and `RegretCallback` do so. Models that were trained without them are known by their spaces alone.
+    """
+    setattr(space, _MARK, observation_digest(task, params))
+
+
 def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> None:
     """Refuses a model that was trained in other spaces, as behind a wrapper that rescales, stacks or converts.
 
-    Its `observation_space` and `action_space` are compared with the env's, if it has them.
+    Its `observation_space` and `action_space` are compared with the env's, if it has them, and so is its `mark`.
 
     Raises:
         PolicyError: they differ; the message says what to evaluate instead.
     """
     history = history_of(model, task, params)
+    if (
+        getattr(getattr(model, "observation_space", None), _MARK, observed := observation_digest(task, params))
+        != observed
+    ):
+        raise PolicyError(
+            f"{name} was trained on other observations: {task.id} observes other values in the same states; restore its "
+            "`observe`, or train again"
+        )
     seen = observation_space(task, params, history)
     own = {"observation": seen, "action": spaces.Box(-1.0, 1.0, (params.action_size,), np.float32)}
     for kind, wanted in own.items():
@@ -211,7 +229,10 @@ def _space(described: Mapping[str, Any]) -> spaces.Box | str:
     shape, dtype = described.get("_shape", described.get("shape")), np.dtype(described["dtype"])
     words = (str(described[end]).replace("[", " ").replace("]", " ").split() for end in ("low", "high"))
     low, high = (np.array(each, np.float64).astype(dtype).reshape(shape) for each in words)
-    return spaces.Box(low, high, dtype=dtype.type)
+    space = spaces.Box(low, high, dtype=dtype.type)
+    if _MARK in described:
+        setattr(space, _MARK, str(described[_MARK]))
+    return space
 
 
 def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]:

@@ -4,7 +4,7 @@ import io
 import itertools
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,13 @@ from matplotlib.ticker import LogFormatter
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.evaluation.basins import AXES, BasinMap, fraction
+from ballbot_train.evaluation.names import ways_on
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
-from ballbot_train.report.labels import ORDER, color, label
+from ballbot_train.report.labels import ORDER, color, labels
 from ballbot_train.report.replay import Take
 
+_LEGEND_COLUMNS = 4  # below each task's axes
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
 
@@ -68,18 +70,22 @@ def trajectory_figure(title: str, takes: Sequence[Take], markers: Sequence[Marke
     return figure
 
 
-def regret_figure(results: Sequence[Result]) -> Figure:
-    """For every task, the share of episodes that each controller finishes within a given regret."""
+def regret_figure(results: Sequence[Result], ways: Mapping[str, str] = {}) -> Figure:
+    """For every task, the share of episodes that each controller finishes within a given regret.
+
+    `ways` are the whole ways of shipped policies by "TASK/NAME".
+    """
     tasks = list(dict.fromkeys(result.task for result in results))
     figure = Figure(figsize=(4.2 * len(tasks), 3.8), layout="constrained")
     axes = figure.subplots(1, len(tasks), squeeze=False)
     for axis, task in zip(axes[0], tasks, strict=True):
-        for i, controller in enumerate(dict.fromkeys(result.controller for result in results if result.task == task)):
+        named = labels((result.controller for result in results if result.task == task), ways_on(ways, task))
+        for i, controller in enumerate(named):
             group = [result for result in results if (result.task, result.controller) == (task, controller)]
             # an episode that stands but misses its goal has no meaningful regret
             regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
             share = 100 * np.arange(1, len(regrets) + 1) / len(group)
-            axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=label(controller))
+            axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=named[controller])
         axis.set(
             xscale="log", xlim=(_LEAST_REGRET, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %"
         )
@@ -87,28 +93,29 @@ def regret_figure(results: Sequence[Result]) -> Figure:
     axes[0][0].set_ylabel("episodes that succeed, %")
     # a controller may be in some of the tasks only
     shown = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    labels = sorted(shown, key=[*ORDER, *shown].index)
-    figure.legend([shown[label] for label in labels], labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    ordered = sorted(shown, key=[*ORDER, *shown].index)
+    columns = min(len(ordered), max(_LEGEND_COLUMNS * len(tasks), 1))
+    figure.legend([shown[each] for each in ordered], ordered, loc="outside lower center", ncols=columns, fontsize=9)
     return figure
 
 
-def robustness_figure(rows: Sequence[Row], task: str) -> Figure:
+def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = {}) -> Figure:
     """Success and regret of every controller on a task against the severity of every disturbance.
 
     Regret, with its 95 % interval, is drawn where at least half of the episodes did not fail.
     """
     stresses = list(dict.fromkeys(row.told["stress"] for row in rows if row.told["stress"] != NONE))
-    controllers = list(dict.fromkeys(row.controller for row in rows if row.task == task))
+    named = labels((row.controller for row in rows if row.task == task), ways_on(ways, task))
     figure = Figure(figsize=(2.9 * len(stresses), 5.6), layout="constrained")
     axes = figure.subplots(2, len(stresses), squeeze=False, sharey="row", sharex="col")
     figure.suptitle(f"{task}: success and regret under disturbances", fontsize=13)
     for i, stress in enumerate(stresses):
         above, below = axes[:, i]
-        for k, controller in enumerate(controllers):
+        for k, controller in enumerate(named):
             points = curve_of(rows, task, controller, stress)
             levels, shade, width = [row.told["level"] for row in points], color(controller, k), max(1.5, 3.5 - k)
             success = [100 * row.success for row in points]
-            above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=label(controller))
+            above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=named[controller])
             standing = [row for row in points if 2 * row.falls <= row.episodes and math.isfinite(row.regret_mean)]
             levels = [row.told["level"] for row in standing]
             below.plot(levels, [100 * row.regret_mean for row in standing], "o-", ms=4, lw=width, color=shade)
@@ -121,14 +128,14 @@ def robustness_figure(rows: Sequence[Row], task: str) -> Figure:
             axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("success, %")
     axes[1][0].set_ylabel(REGRET)
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    handles, texts = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, texts, loc="outside lower center", ncols=min(len(texts), _LEGEND_COLUMNS), fontsize=9)
     return figure
 
 
-def basin_figure(maps: Sequence[BasinMap]) -> Figure:
+def basin_figure(maps: Sequence[BasinMap], ways: Mapping[str, str] = {}) -> Figure:
     """The initial states from which each controller recovers, coloured, on those that the robot's limits allow, grey."""
-    controllers = list(maps[0].recovered)
+    controllers, named = list(maps[0].recovered), labels(maps[0].recovered, ways_on(ways, "stabilize"))
     size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(maps), len(controllers), squeeze=False, sharex=True, sharey="row")
@@ -141,7 +148,7 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
                 basin.leans, basin.values, cells, cmap=colors, vmin=0, vmax=2, shading="nearest", alpha=0.85
             )
             axis.fill(*basin.boundary.T, fill=False, ec="k", lw=1.6)
-            axis.set_title(f"{label(controller)}: {fraction([basin], controller):.0%}", fontsize=10)
+            axis.set_title(f"{named[controller]}: {fraction([basin], controller):.0%}", fontsize=10)
             axis.axhline(0, color="0.5", lw=0.5)
             axis.axvline(0, color="0.5", lw=0.5)
             axis.set_xlim(-81, 81)

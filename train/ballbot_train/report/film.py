@@ -4,6 +4,7 @@ import math
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import imageio.v2 as imageio
@@ -12,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ballbot_gym import dynamics, files
-from ballbot_gym.picture import picture
+from ballbot_gym.drawing.picture import picture
 from ballbot_train.report.replay import LEAST_SLIP, Replay
 
 Format = Literal["png", "mp4", "webp"]
@@ -55,10 +56,12 @@ def write_film(frames: Iterable[np.ndarray], path: Path, fps: int = 25) -> Path:
         content = imageio.mimwrite("<bytes>", shown, "webp", **options)
     else:
         options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-        with imageio.get_writer("<bytes>", "mp4", **options) as writer:
-            for frame in frames:
-                writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
-        content = writer.request.get_result()
+        with TemporaryDirectory() as folder:  # imageio would leave a file of its own if it is interrupted
+            unfinished = Path(folder) / "film.mp4"
+            with imageio.get_writer(unfinished, **options) as writer:
+                for frame in frames:
+                    writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+            content = unfinished.read_bytes()
     return files.write(path, content)
 
 

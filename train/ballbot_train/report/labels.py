@@ -1,6 +1,10 @@
 """The name and the colour of each controller, the same in every figure, film and page."""
 
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+
+from ballbot_train.evaluation.names import ARROW, shortened, with_way
 
 _CONTROLLERS = {
     "lqr": ("LQR", "#c0392b"),
@@ -27,8 +31,24 @@ def color(controller: str, i: int = 0) -> str:
     return _CONTROLLERS.get(controller, ("", _OTHER_COLORS[i % len(_OTHER_COLORS)]))[1]
 
 
-def label(controller: str) -> str:
-    """The name of a controller in figures; a policy file is named after its file and the file's folder."""
+def label(controller: str, way: str = "") -> str:
+    """The name of a controller in figures; a policy file is named after its file and the file's folder.
+
+    A shipped policy has the whole way of its training, if it is given.
+    """
     path = Path(controller)
     stem = f"{path.parent.name}/{path.stem}" if path.suffix and path.parent.name else path.stem
-    return _CONTROLLERS.get(stem, (stem, ""))[0]
+    return ARROW.join(_CONTROLLERS.get(part, (part, ""))[0] for part in with_way(stem, way).split(ARROW))
+
+
+def labels(controllers: Iterable[str], ways: Mapping[str, str] = {}) -> dict[str, str]:
+    """The label of each controller of a figure, by its name. No two are the same: then of paths more is shown.
+
+    Args:
+        controllers: their names.
+        ways: the whole ways of shipped policies, by their names.
+    """
+    found = {name: label(name, ways.get(name, "")) for name in controllers}
+    short, counts = shortened(found), Counter(found.values())
+    found = {name: short[name] if counts[text] > 1 else text for name, text in found.items()}
+    return found if len(set(found.values())) == len(found) else dict(zip(found, found, strict=True))

@@ -1,33 +1,78 @@
 """The page of the live playground: its controls, and the loop that keeps the simulation in real time.
 
-viser calls back in a thread of its own. What a browser asks for goes into a queue, and the loop of the simulation does it
-between two steps. So the playground needs no locks.
+Browsers ask for things in the server's thread. The loop of the simulation does them between two steps, so the playground
+needs no locks. Of what is asked for several times meanwhile, the last counts: no number of requests can make the loop late.
 """
 
 import math
-import queue
+import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from ballbot_gym import certified, dynamics
-from ballbot_gym.drawing import PUSH_SCALE
+from ballbot_gym.drawing.viewer import Viewer
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.viewer import Viewer
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.report import labels
-from ballbot_train.report.simulation import Playground, Start, severities
-from ballbot_train.work.console import markdown_text
+from ballbot_train.report.simulation import Playground, Runner, Start, failure_word, severities
 
 PATIENCE = 0.1
 """s of lag that is caught up; more, as of a planner, is given up."""
-_DRAW_HZ, _TEXT_HZ = 30.0, 4.0
+_DRAW_HZ, _TEXT_HZ = 50.0, 10.0
 _IDLE = 0.1  # s, between two looks while nobody is there
-_SLOWEST, _FASTEST = 0.1, 2.0  # simulated seconds per second
+_SPEEDS = (0.1, 2.0, 0.01)  # simulated seconds per second: least, greatest, step
 _NOTICE_LENGTH = 300
-_HELP = "Drag the robot and let go: every robot gets the same push."
+_HELP = "Drag a robot and let go: every robot gets the same push. Drag the floor to look around."
+_GHOSTS, _HIDDEN = "Ghosts", "Changes that the controllers do not know"
+
+
+@dataclass(frozen=True)
+class Control:
+    """Something that a page may change. Pages ask for it by its name."""
+
+    name: str
+    apply: Callable[[Any], object]
+    """Changes it to a value that `checked` has returned."""
+    read: Callable[[], Any] = lambda: None
+    """Its present value; None of a button."""
+    options: tuple[str, ...] = ()
+    """The values of a choice."""
+    limits: tuple[float, float, float] | None = None
+    """Least and greatest value and step of a slider."""
+    group: str = ""
+    """The title under which the page shows it."""
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """What stream.js shows."""
+        return {
+            "name": self.name,
+            "group": self.group,
+            "value": self.read(),
+            "options": self.options or None,
+            "limits": self.limits,
+        }
+
+    def checked(self, value: Any) -> Any:
+        """A value that came from a page.
+
+        Raises:
+            ValueError: the control cannot have this value.
+        """
+        if self.options:
+            if value not in self.options:
+                raise ValueError(f"{self.name} cannot be {value!r}; choose one that the page lists")
+        elif self.limits is not None:
+            low, high, _ = self.limits
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                raise ValueError(f"{self.name} must be a number from {low:g} to {high:g}, not {value!r}")
+        elif not isinstance(value, bool):
+            raise ValueError(f"{self.name} must be true or false, not {value!r}")
+        return value
 
 
 class PlayPage:
@@ -40,15 +85,16 @@ class PlayPage:
             playground: what is simulated.
             viewer: where it is shown. The page closes neither of them.
         """
-        self.playground, self.viewer, self._gui = playground, viewer, viewer.server.gui
+        self.playground, self.viewer = playground, viewer
         self.paused = self.stopped = False
-        self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self.speed = 1.0
+        self._asked: dict[str, Any] = {}  # by the name of a control, the last value that a page asked for
+        self._lock = threading.Lock()  # of that
+        self._controls: dict[str, Control] = {}
         self._next_text = 0.0
-        self._bound: list[tuple[Any, Callable[[], Any]]] = []
-        self._ghosts: dict[str, Any] = {}
         playground.announce = self._announce
-        viewer.on_grab = lambda vector: self._requests.put(lambda: playground.push(*(vector / PUSH_SCALE).tolist()))
-        self._build()
+        self._refresh()
+        viewer.on_ask = self._ask
 
     # --- the loop ---
 
@@ -58,7 +104,7 @@ class PlayPage:
         end = now + seconds
         while not self.stopped and now < end:
             self._do_requests()
-            if not self.watched:
+            if not self.viewer.is_watched:
                 time.sleep(_IDLE)
                 now = due = time.perf_counter()
                 continue
@@ -70,127 +116,136 @@ class PlayPage:
                 self.playground.step()
             if now >= next_draw:
                 self.viewer.draw(self.playground.drawing())
-                next_draw = max(next_draw, now) + 1 / _DRAW_HZ
+                next_draw = max(next_draw + 1 / _DRAW_HZ, now)
             if now >= self._next_text:
                 self._next_text = now + 1 / _TEXT_HZ
                 self._refresh()
             time.sleep(max(0.0, min(due, next_draw) - time.perf_counter()))
 
-    @property
-    def watched(self) -> bool:
-        """Whether a browser shows the page."""
-        return bool(self.viewer.server.get_clients())
-
     def next_due(self, now: float, due: float) -> float:
         """When the step is due, s, that follows one that was due at `due` and begins now."""
-        return max(due, now - PATIENCE) + self.playground.world.task.control_dt / max(_SLOWEST, self.speed.value)
+        return max(due, now - PATIENCE) + self.playground.world.task.control_dt / self.speed
+
+    def _ask(self, name: str, value: Any) -> None:
+        """Takes a request, in the server's thread. What names no control is left out."""
+        with self._lock:
+            if name in self._controls:
+                self._asked.pop(name, None)  # so that it comes after the others
+                self._asked[name] = value
 
     def _do_requests(self) -> None:
         """Does what was asked for until now. What cannot be done is said, and the simulation goes on."""
-        while not self._requests.empty():
+        with self._lock:
+            asked, self._asked = self._asked, {}
+        for name, value in asked.items():
             self.playground.notice = ""
             try:
-                self._requests.get()()
+                control = self._controls[name]
+                control.apply(control.checked(value))
             except Exception as error:
                 self.playground.notice = str(error) or repr(error)
-            self._next_text = 0.0
+            self._refresh()
 
     # --- controls ---
 
-    def _build(self) -> None:
-        gui, playground = self._gui, self.playground
-        self._status = gui.add_markdown("")
-        self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_world, lambda: playground.world.task_name)
-        self._bind(
-            gui.add_dropdown("Robot", tuple(name for name in ROBOTS if ROBOTS[name].params.wheels is None)),
-            lambda robot: playground.set_world(robot=robot),
-            lambda: playground.world.robot,
-        )
-        self._controller = gui.add_dropdown("Controller", ("lqr",))
-        self._bind(self._controller, playground.set_controller, lambda: playground.main.name)
-        self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
-        with gui.add_folder("What the controllers do not know", expand_by_default=False):
-            for stress, described in STRESSES.items():
-                slider = gui.add_slider(described.label, *severities(stress), initial_value=0.0)
-                self._bind(slider, partial(playground.set_plant, stress), partial(playground.plant.get, stress))
-            told = gui.add_button("All as the controllers believe")
-            told.on_click(self._asking(lambda _: [playground.set_plant(stress, 0.0) for stress in STRESSES]))
-        with gui.add_folder("Time"):
-            actions = {
-                "Play / pause": ("space", self._toggle),
-                "Restart": ("R", playground.restart),
-                "Random": ("N", partial(playground.begin, "random")),
-            }
-            group = gui.add_button_group(" ", tuple(actions), hint="keys: space, R and N")
-            group.on_click(self._asking(lambda button: actions[button][1]()))
-            self.speed = gui.add_slider("Speed", _SLOWEST, _FASTEST, step=0.1, initial_value=1.0)
-            episodes: dict[str, Start] = {"rest": "rest", "random": "random"}
+    def _made_controls(self) -> list[Control]:
+        playground, known = self.playground, tuple(self.playground.world.controllers)
+        episodes: dict[str, Start] = {"rest": "rest", "random": "random"}
+        if playground.world.certified is not None:
             episodes |= {str(i): i for i in range(certified.EPISODES)}
-            shown = gui.add_dropdown("Episode", tuple(episodes))
-            self._bind(shown, lambda name: playground.begin(episodes[name]), lambda: str(playground.episode))
-        for label, (key, action) in actions.items():
-            gui.add_command(label, hotkey=key).on_trigger(self._asking(lambda _, action=action: action()))
-        self._refresh()
-
-    def _bind(self, control: Any, apply: Callable[[Any], object], read: Callable[[], Any]) -> None:
-        """Lets a control change the playground. What is refused goes back to what `read` says."""
-        control.on_update(self._asking(apply))
-        self._bound.append((control, read))
-
-    def _asking(self, action: Callable[[Any], object]) -> Any:
-        """A callback of viser that asks for something, by the value that the control has got.
-
-        It is a coroutine of viser's loop, so that callbacks come in the order of the changes.
-        """
-
-        async def asked(event: Any) -> None:
-            value = getattr(event.target, "value", None)
-            if event.client_id is not None:  # not set by this program
-                self._requests.put(lambda: action(value))
-
-        return asked
+        return [
+            Control("Task", playground.set_world, lambda: playground.world.task_name, tuple(TASKS)),
+            Control("Robot", lambda to: playground.set_world(robot=to), lambda: playground.world.robot, tuple(ROBOTS)),
+            Control("Controller", playground.set_controller, lambda: playground.main.name, known),
+            Control(
+                "Episode", lambda to: playground.begin(episodes[to]), lambda: str(playground.episode), tuple(episodes)
+            ),
+            *(
+                Control(
+                    name, partial(self._set_ghost, name), partial(playground.ghosts.__contains__, name), group=_GHOSTS
+                )
+                for name in known
+            ),
+            *(
+                Control(
+                    stress.label,
+                    partial(playground.set_plant, name),
+                    partial(playground.plant.get, name),
+                    limits=severities(name),
+                    group=_HIDDEN,
+                )
+                for name, stress in STRESSES.items()
+            ),
+            Control("Change nothing", lambda _: self._reset_plant(), group=_HIDDEN),
+        ]
 
     def _refresh(self) -> None:
         """Shows what holds now, in every control and in words."""
-        playground, names = self.playground, tuple(self.playground.world.controllers)
-        if tuple(self._ghosts) != names:
-            self._controller.options = names
-            for box in self._ghosts.values():
-                box.remove()
-            with self._ghost_folder:
-                self._ghosts = {name: self._gui.add_checkbox(name, False) for name in names}
-            for name, box in self._ghosts.items():
-                box.on_update(self._asking(partial(self._set_ghost, name)))
-        shown = [(box, partial(playground.ghosts.__contains__, name)) for name, box in self._ghosts.items()]
-        for control, read in [*self._bound, *shown]:
-            if control.value != (value := read()):
-                control.value = value
-        self._status.content = self._text()
+        shown = self._made_controls()
+        hidden = [
+            Control("playing", self._set_playing, lambda: not self.paused),
+            Control("speed", partial(setattr, self, "speed"), lambda: self.speed, limits=_SPEEDS),
+            Control("Restart", lambda _: self.playground.restart()),
+            _Push("push", lambda impulse: self.playground.push(*impulse)),
+        ]  # which stream.js has places of its own for
+        with self._lock:
+            self._controls = {control.name: control for control in [*shown, *hidden]}
+        self.viewer.send("panel", [control.shown for control in shown])
+        self.viewer.send("status", self._status())
 
-    # --- what they do ---
+    def _set_playing(self, playing: bool) -> None:
+        self.paused = not playing
 
     def _set_ghost(self, name: str, wanted: bool) -> None:
         others = [ghost for ghost in self.playground.ghosts if ghost != name]
         self.playground.set_ghosts([*others, *[name] * wanted])
 
-    def _toggle(self) -> None:
-        self.paused = not self.paused
+    def _reset_plant(self) -> None:
+        for stress in STRESSES:
+            self.playground.set_plant(stress, 0.0)
 
     # --- words ---
 
     def _announce(self, text: str) -> None:
         """Says what is about to be done, before it is done."""
-        self._status.content = f"**{markdown_text(text)}**"
+        self.viewer.send("status", self._status() | {"text": text})
         self._next_text = 0.0
 
-    def _text(self) -> str:
-        """What goes on."""
-        playground, main = self.playground, self.playground.main
-        status = f"{labels.label(main.name)}, {playground.seconds:.1f} s of {playground.world.task.duration:g} s"
-        cost = f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, cost {main.cost:.2f}"
-        if math.isfinite(best := playground.optimum_cost):
-            cost += f", the optimum's {best:.2f}"
-        lines = [f"**{markdown_text(status)}**", cost, *["paused"] * self.paused]
-        lines += [markdown_text(score.text) for score in playground.scores[-1:]]
-        lines.append(f"*{markdown_text(playground.notice[:_NOTICE_LENGTH])}*" if playground.notice else _HELP)
-        return "  \n".join(lines)
+    def _status(self) -> dict[str, Any]:
+        """What happens, as stream.js shows it."""
+        playground = self.playground
+        said = [score.text + "." for score in playground.scores[-1:]]
+        if math.isfinite(playground.optimum_cost):
+            said.append(f"The optimum of this episode costs {playground.optimum_cost:.2f}.")
+        said.append(playground.notice[:_NOTICE_LENGTH] or _HELP)
+        return {
+            "text": " ".join(said),
+            "clock": f"{playground.seconds:.1f} s of {playground.world.task.duration:g} s",
+            "rows": [
+                self._row(runner, color) for runner, color in zip(playground.runners, playground.colors, strict=True)
+            ],
+            "playing": not self.paused,
+            "speed": self.speed,
+        }
+
+    def _row(self, runner: Runner, color: str) -> dict[str, Any]:
+        """A row of the page's table."""
+        tilt, peak = (f"{math.degrees(angle):.0f}°" for angle in (dynamics.tilt(runner.x), runner.peak))
+        end = failure_word(runner.violated)
+        if runner.arrived and math.isfinite(self.playground.optimum_cost):
+            end = f"regret {100 * (runner.cost / self.playground.optimum_cost - 1):.1f} %"
+        return {
+            "label": labels.label(runner.name),
+            "color": color,
+            "cells": [tilt, peak, f"{math.hypot(*runner.force):.0f} N", f"{runner.cost:.1f}", end],
+            "mood": "bad" if runner.violated else "good" if runner.arrived else "",
+        }
+
+
+class _Push(Control):
+    """A push, which the page makes of a drag."""
+
+    def checked(self, value: Any) -> Any:
+        if not isinstance(value, list) or len(value) != 2 or not all(type(part) in (int, float) for part in value):
+            raise ValueError("a push must be two numbers")
+        return value

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from ballbot_gym import drawing, files
-from ballbot_gym.params import BallbotParams
+from ballbot_gym import files
+from ballbot_gym.drawing import page
 from ballbot_train.report.replay import Replay, Take
 from ballbot_train.work import templates
 
@@ -41,31 +41,21 @@ def report_page(
         facts: what the results depend on, such as versions; shown at the foot of the page.
     """
     episodes = [_episode_data(replay) for replay in replays if replay.takes]
-    page = render(
+    text = render(
         "page.html.j2",
         title=title,
         header=header,
         rows=rows,
-        data=scene_data(replays[0].params) | {"episodes": episodes} if episodes else {},
+        data=page.look(replays[0].params) | {"episodes": episodes} if episodes else {},
         pictures={
             name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
             for name, group in pictures.items()
         },
         facts=facts,
         style=asset("style.css"),
-        scripts=[asset(name) for name in ("table.js", "scene.js", "replay.js")],
+        scripts=[asset("table.js"), Markup(page.asset("scene.js")), asset("replay.js")],
     )
-    return str(page)
-
-
-def scene_data(params: BallbotParams) -> dict[str, object]:
-    """How scene.js draws a robot."""
-    return {
-        "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
-        "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
-        "force_scale": drawing.FORCE_SCALE,
-        "least_force": drawing.LEAST_FORCE,
-    }
+    return str(text)
 
 
 def render(template: str, **values: object) -> Markup:
@@ -100,6 +90,6 @@ def _take_data(take: Take) -> dict[str, object]:
         "label": take.label,
         "color": take.color,
         "note": take.note,
-        "x": x[:, :4].round(4).tolist(),
+        "x": np.hstack([x[:, :4], x[:, 8:9]]).round(4).tolist(),  # with the heading of a robot with wheels
         "u": u.round().astype(int).tolist(),
     }

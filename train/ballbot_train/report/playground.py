@@ -15,10 +15,10 @@ from typing import Any
 
 import casadi
 import numpy as np
-from markupsafe import Markup
 
-from ballbot_baselines.lqr import LqrController
+from ballbot_baselines import LqrController
 from ballbot_gym import certified, drawing, dynamics, files
+from ballbot_gym.drawing import page
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.randomization import TRACKS, Randomization
@@ -29,7 +29,7 @@ from ballbot_train.policy.files import BEST, PolicyError, read_description, ship
 from ballbot_train.policy.network import PolicyNetwork, load_network
 from ballbot_train.policy.printed import javascript_function, layers_of, policy_function
 from ballbot_train.report import labels
-from ballbot_train.report.page import asset, render, scene_data
+from ballbot_train.report.page import asset
 
 _UNKNOWN = {"body_mass": "mass", "com_height": "centre of mass", "force": "force"}
 """Factors that the reader may change, within those of the track "unknown", and what the page calls them."""
@@ -98,17 +98,16 @@ def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
         PolicyError: a file is no policy, or that of one that sees more than the present observation.
         ValueError: a policy is of no registered task, two are of one task, or the page would be larger than `LARGEST`.
     """
-    page = render(
-        "playground.html.j2",
-        titles=[scenario.title for scenario in SCENARIOS],
-        unknown={label: getattr(TRACKS["unknown"], name) for name, label in _UNKNOWN.items()},
-        style=asset("playground.css"),
-        scripts=[Markup(engine_script(policies)), asset("scene.js"), asset("playground.js")],
-    )
-    size = len(page.encode())
+    text = playground_page(policies)
+    size = len(text.encode())
     if size > LARGEST:
         raise ValueError(f"the page would have {size / 1e6:.2f} MB, and at most {LARGEST / 1e6:g} MB load at once")
-    return files.write(path, page)
+    return files.write(path, text)
+
+
+def playground_page(policies: Sequence[str] = (), live: bool = False) -> str:
+    """The page as HTML; `live` as for `page_html`. Errors: as of `write_playground`."""
+    return page.page_html(engine_script(policies), asset("playground.js"), live)
 
 
 def engine_script(policies: Sequence[str] = ()) -> str:
@@ -118,11 +117,11 @@ def engine_script(policies: Sequence[str] = ()) -> str:
     data = {
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
-        **scene_data(params),
-        "push_scale": drawing.PUSH_SCALE,
+        **page.look(params),
         "ghost_opacity": drawing.GHOST_OPACITY,
         "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr")},
         "policies": {task: _policy_data(paths[task], network) for task, network in networks.items()},
+        "unknown": {label: getattr(TRACKS["unknown"], name) for name, label in _UNKNOWN.items()},
         "you": {"label": "you", "color": labels.YOU},
         "best": {"label": "optimum", "color": labels.OPTIMUM},
         "scenarios": [_scenario_data(each, episode, params) for each in SCENARIOS for episode in each.episodes],

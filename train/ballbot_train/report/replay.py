@@ -20,6 +20,7 @@ from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.names import shortened
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.runner import floor
+from ballbot_train.policy.files import shipped_policies, way_of
 from ballbot_train.report import labels
 
 LEAST_SLIP = 0.02
@@ -111,7 +112,8 @@ def certified_replay(
     if not 0 <= episode < certified.EPISODES:
         raise ValueError(f"episode must be 0 to {certified.EPISODES - 1}, not {episode}")
     episode_set = optima.known(problem, robot, [episode])
-    takes = []
+    takes, shipped = [], shipped_policies(problem, robot, None)
+    named = labels.labels(controllers, {name: way_of(path) for name, path in shipped.items() if name in controllers})
     for name, friction in itertools.product(controllers, frictions or (None,)):
         controller, slips = make_controller(name, problem, params), list[float]()
         env = BallbotEnv(problem, physics=physics, robot=floor(robot, friction))
@@ -126,7 +128,7 @@ def certified_replay(
             continue
         finally:
             env.close()
-        label, color, slip = labels.label(name), labels.color(Path(name).stem, len(takes)), np.array(slips)
+        label, color, slip = named[name], labels.color(Path(name).stem, len(takes)), np.array(slips)
         note = f"fails at {run.trajectory.duration:.2f} s"
         if not run.failure:
             regret = round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0  # no −0.0

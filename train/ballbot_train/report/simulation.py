@@ -55,13 +55,11 @@ class World:
         """A task and a robot by name.
 
         Raises:
-            ValueError: an unknown task or robot, or a robot with wheels.
+            ValueError: an unknown task or robot.
         """
         check_names("task", [task], TASKS)
         check_names("robot", [robot], ROBOTS)
         self.task_name, self.robot, self.params = task, robot, named_robot(robot)
-        if self.params.wheels is not None:
-            raise ValueError(f"the playground knows no robot with wheels, as {robot}; watch it with ballbot replay")
         self.task = make_task(task, robot)
         known = names(self.task, robot)
         experts = [name for name in known if is_expert(name)]
@@ -85,18 +83,20 @@ class Runner:
     states: list[State] = field(default_factory=list)
     forces: list[tuple[float, ...]] = field(default_factory=list)
     cost: float = 0.0
+    peak: float = 0.0
+    """Largest tilt, rad."""
     violated: str = ""
     arrived: bool = False
 
     @property
     def x(self) -> State:
-        """(8,) the state."""
+        """(n,) the state."""
         return self.states[-1]
 
     @property
     def force(self) -> tuple[float, ...]:
-        """(2,) the last force, N."""
-        return self.forces[-1] if self.forces else (0.0, 0.0)
+        """(m,) the last force, N."""
+        return self.forces[-1] if self.forces else (0.0,) * self.env.params.action_size
 
     @property
     def stands_still(self) -> bool:
@@ -104,10 +104,10 @@ class Runner:
         return self.violated != "" or self.arrived
 
     def begin(self, start: tuple[np.ndarray, np.ndarray], seed: int) -> None:
-        """Begins an episode in a state (8,) with constants (nc,). The seed is of all that is drawn in it."""
+        """Begins an episode in a state (n,) with constants (nc,). The seed is of all that is drawn in it."""
         self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
         self.states, self.forces = [tuple(start[0].tolist())], []
-        self.cost, self.violated, self.arrived = 0.0, "", False
+        self.cost, self.peak, self.violated, self.arrived = 0.0, float(dynamics.tilt(self.x)), "", False
 
     def move_to(self, env: BallbotEnv) -> None:
         """Goes on in another environment, in the middle of an episode."""
@@ -119,14 +119,14 @@ class Runner:
         self.env.set_state(self.env.get_state()._replace(x=self.x, memory=(), **kept))
 
     def command(self, seconds: float) -> np.ndarray:
-        """(2,) the force, N, that the controller commands at that time of the episode, s.
+        """(m,) the force, N, that the controller commands at that time of the episode, s.
 
         Raises:
             FloatingPointError: a force that is not finite.
         """
         u = self.controller.act(seconds, sensed(self.env, np.array(self.x), seconds))
         u = np.asarray(u, np.float64)
-        if u.shape != (2,) or not np.isfinite(u).all():
+        if u.shape != (self.env.params.action_size,) or not np.isfinite(u).all():
             raise FloatingPointError(f"it commands {u} N")
         return u
 
@@ -137,11 +137,12 @@ class Runner:
         self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
 
     def step(self, command: np.ndarray) -> None:
-        """Holds a command (2,), N, for one control step."""
+        """Holds a command (m,), N, for one control step."""
         _, _, terminated, _, info = self.env.step(command / self.env.params.force_limit)
         self.states.append(tuple(info["state"].tolist()) if np.isfinite(info["state"]).all() else self.x)
         self.forces.append(tuple(info["force"].tolist()))
         self.cost += info["cost"]
+        self.peak = max(self.peak, float(dynamics.tilt(self.x)))
         self.violated = self.env.limit_names[info["violated"]] if info["failure"] else ""
         self.arrived = terminated and info["success"]
 
@@ -162,7 +163,7 @@ class Score(NamedTuple):
         """In words."""
         regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %"
         if self.failure:
-            return f"{self.controller}: {_failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
+            return f"{self.controller}: {failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
         return f"{self.controller}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
 
 
@@ -252,14 +253,18 @@ class Playground:
         """(2,) the push that is drawn, N·s; None if there was none lately."""
         return self._push if self.elapsed < self._push_until else None
 
+    @property
+    def colors(self) -> list[str]:
+        """Of the robots in pictures."""
+        return [labels.color(Path(runner.name).stem, i) for i, runner in enumerate(self.runners)]
+
     def drawing(self) -> Drawing:
         """The present moment."""
-        main, robots, paths = self.main, [], []
-        colors = [labels.color(Path(runner.name).stem, i) for i, runner in enumerate(self.runners)]
+        main, robots, paths, colors = self.main, [], [], self.colors
         for i, runner in reversed(list(enumerate(self.runners))):
             alpha = GHOST_OPACITY if i else 1.0
             force = np.array(runner.force) if runner is main and not main.violated else None
-            said = _failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
+            said = failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
             label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
             robots.append(Robot(np.array(runner.x), colors[i], force, alpha, push, label))
             trace = np.array(runner.states[:-_TRACE_STEPS:-_TRACE_EVERY])[:, :2]
@@ -283,7 +288,8 @@ class Playground:
                 try:
                     command = runner.command(self.seconds)
                 except Exception as error:  # a controller of any kind, such as a policy: the others go on
-                    self.notice, command = f"{labels.label(runner.name)}: {error}", np.zeros(2)
+                    self.notice = f"{labels.label(runner.name)}: {error}"
+                    command = np.zeros(self.world.params.action_size)
                 runner.step(command)
         self.elapsed += 1
         if self.elapsed >= self.world.task.steps or self.main.stands_still:
@@ -334,9 +340,15 @@ class Playground:
         low, high, step = severities(stress)
         if not low <= value <= high:
             raise ValueError(f"{stress} must be {low:g} to {high:g}, not {value:g}")
+        before = self.plant[stress]
         self.plant[stress] = step * round(value / step)
-        for runner in self.runners:
-            runner.move_to(self._env(self.world))
+        try:
+            made = [self._env(self.world) for _ in self.runners]
+        except ValueError:
+            self.plant[stress] = before
+            raise
+        for runner, env in zip(self.runners, made, strict=True):
+            runner.move_to(env)
 
     def restart(self) -> None:
         """Begins the same episode again."""
@@ -349,7 +361,7 @@ class Playground:
         task, known = self.world.task, self.world.certified
         if episode in ("rest", "random"):
             x, c = task.sample(self._rng, self.world.params)
-            self._begin((np.zeros(8) if episode == "rest" else x, c), episode)
+            self._begin((np.zeros(self.world.params.state_size) if episode == "rest" else x, c), episode)
         elif known is None:
             raise ValueError(
                 f"{self.world.task_name} has no certified episodes for {self.world.robot}; begin a random one"
@@ -382,6 +394,7 @@ class Playground:
         seed = int(self._rng.integers(2**32))  # the same for all, so that they meet the same robot, noise and pushes
         for runner in self.runners:
             runner.begin(start, seed)
+        for runner in self.runners:
             self.announce(f"preparing {labels.label(runner.name)} …")
             try:
                 runner.controller.reset(0.0, *map(np.array, start))
@@ -413,7 +426,7 @@ class Playground:
             self._begin((np.array(main.x), self.start[1]), "random")
 
 
-def _failure_word(limit: str) -> str:
+def failure_word(limit: str) -> str:
     """What a violated limit means, in words; "" for none."""
     return {
         "": "",

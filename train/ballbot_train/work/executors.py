@@ -30,7 +30,10 @@ _NODE_SECONDS = 5.0  # between two looks whether a cluster has more cores
 _RETRIES = 5  # of a task on a cluster whose worker or node dies
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
 _PER_CORE = 2  # tasks in flight for every core of a cluster, so that no core waits for its next one
-
+_NOT_STARTED = (
+    "a worker process could not start; its own error is above. Each imports the script that started the run, so a script "
+    'must do its work under if __name__ == "__main__":, or with workers=1'
+)
 
 Key = TypeVar("Key")
 
@@ -150,9 +153,21 @@ def _local(workers: Workers) -> Iterator[Pool]:
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
     # a forked child would share PyBullet's clients and CasADi's state
-    pool = ProcessPoolExecutor(workers.here, get_context("spawn"), _prepare)
+    pool, started = ProcessPoolExecutor(workers.here, get_context("spawn"), _prepare), dict[int, Any]()
+
+    def submit(*task: Any) -> Future:
+        future = pool.submit(_attempt, *task)
+        started.update(pool._processes or {})
+        return future
+
     try:
-        yield (lambda *task: pool.submit(_attempt, *task)), lambda: workers.here
+        yield submit, lambda: workers.here
+    except WorkerError as error:
+        for process in started.values():
+            process.join(1.0)
+        if any(process.exitcode == 1 for process in started.values()):  # one that is killed has a negative number
+            raise WorkerError(_NOT_STARTED) from error
+        raise
     finally:
         for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
             process.terminate()

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
+from ballbot_gym.identity import changed_parts
 from ballbot_gym.lazy import imports_of
 from ballbot_train.work.console import progress_bars
 from ballbot_train.work.executors import Workers, completed
@@ -33,6 +34,16 @@ MARKER = "unfinished.json"
 _FOLDER = "unfinished"
 _LOCK = ".lock"
 _LIMIT = 2**32  # bytes of a job's file
+_DIGESTS = {
+    "problem": "an unknown problem",
+    "problems": "unknown problems",
+    "networks": "unknown policies",
+    "start_policy": "an unknown policy to start from",
+    "demonstrations": "unknown demonstrations",
+    "expert_policy": "an unknown policy as expert",
+}
+"""Settings that hold digests, and what a folder is of whose settings lack them, because an earlier version made it."""
+_FILES = {"start_policy": "--start", "demonstrations": "--demos", "expert_policy": "--expert"}
 _held: dict[Path, filelock.BaseFileLock] = {}
 
 
@@ -129,14 +140,33 @@ def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any], of: str = "
     """What differs, in words; of settings that are themselves named values, only those that differ."""
     for key in {**held, **wanted}:
         old, new = held.get(key), wanted.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
+        if old == new:
+            continue
+        if key in _DIGESTS and new is not None and not isinstance(old, type(new)):
+            yield f"{_DIGESTS[key]}, because an earlier version made it"
+        elif key == "problem" or of == "problems ":
+            yield _changed_problem(key, old, new)
+        elif key in _FILES:
+            if new is not None:  # else that option is another, which is said of it
+                yield f"a file of {_FILES[key]} that has changed since"
+        elif of in ("policies ", "networks "):
+            if None not in (old, new):  # else the controllers are others, which is said of these
+                yield f"the policy {key}, whose {'weights have' if of == 'policies ' else 'description has'} changed since"
+        elif isinstance(old, dict) and isinstance(new, dict):
             yield from _differences(old, new, f"{of}{key} ")
-        elif old is None and key == "problem":
-            yield "an unknown problem, because an earlier version made it"
-        elif old != new and (key == "problem" or of == "problems "):
-            yield f"another {of}{key}: its episodes, costs, limits, observations or robot have changed since"
-        elif old != new:
+        else:
             yield f"{of}{key} {old!r}, not {new!r}"
+
+
+def _changed_problem(key: str, old: Any, new: Any) -> str:
+    """Another problem in words; key is "problem", or "TASK" or "ROBOT/TASK"."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return f"problem {key} {old!r}, not {new!r}"
+    parts = changed_parts(old, new)
+    *most, last = parts
+    listed = f"{', '.join(most)} and {last}" if most else last
+    named = "" if key == "problem" else f" {key}"
+    return f"another problem{named}: its {listed} {'have' if last.endswith('s') or most else 'has'} changed since"
 
 
 def release(out: Path, marker: str = MARKER) -> None:

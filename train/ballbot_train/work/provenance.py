@@ -17,7 +17,7 @@ def provenance() -> dict[str, object]:
         "python": platform.python_version(),
         **{name: _version(name) for name in _PACKAGES},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "load": round(os.getloadavg()[0], 2),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else "unknown",  # Windows has none
     }
 
 

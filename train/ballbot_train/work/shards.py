@@ -1,6 +1,6 @@
 """Data sets of any size as shards: .npz files of some hundred episodes, in a folder or on object storage.
 
-A set is a folder of any kind that fsspec knows, such as runs/set, s3://BUCKET/set or gs://BUCKET/set:
+A set is a folder of this machine, or of storage that fsspec knows: runs/set, s3://BUCKET/set or gs://BUCKET/set, say.
 
 | file | holds |
 |---|---|
@@ -35,6 +35,11 @@ EPISODES = 500
 MANIFEST = "manifest.json"
 _CHUNK = 5  # episodes that a worker makes at a time
 _LIMIT = 2**32  # bytes of a shard, unpacked
+_DENSEST = 8  # bytes that a byte of a shard may unpack to: those written here are not compressed
+_MOST = 1_000_000  # shards, and episodes of each
+_STORAGE = ("file", "local", "memory", "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oss", "oci", "hf")
+_STORAGE += ("http", "https", "sftp", "ssh", "hdfs", "webhdfs")
+"""Of fsspec's schemes those of storage. Others unpack, cache or combine what yet other addresses hold."""
 _VERSION = 1
 
 Arrays = Mapping[str, np.ndarray]
@@ -54,7 +59,7 @@ class Shards:
         """What the set was made from; None where there is none yet."""
         self._shards: dict[int, dict[str, Any]] = {}
         try:
-            self._files, self._root = fsspec.core.url_to_fs(self.url)
+            self._files, self._root = _place_of(self.url)
             text = self._content(MANIFEST, files.JSON_LIMIT)
         except FileNotFoundError:
             return
@@ -67,6 +72,8 @@ class Shards:
             self.about = dict(manifest["about"])
             for i, shard in manifest["shards"].items():
                 known = {"episodes": int(shard["episodes"]), "sha256": str(shard["sha256"])}
+                if not (0 <= int(i) <= _MOST and 0 <= known["episodes"] <= _MOST):
+                    raise ValueError(f"shard {i:.20} of {known['episodes']} episodes, and at most {_MOST} are possible")
                 self._shards[int(i)] = shard | known
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise files.FileError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
@@ -98,7 +105,7 @@ class Shards:
             raise files.FileError(f"{path} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != self._shards[number]["sha256"]:
             raise files.FileError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
-        return files.read_npz(path, _LIMIT, content)
+        return files.read_npz(path, min(_LIMIT, _DENSEST * len(content)), content)
 
     def _content(self, name: str, limit: int) -> bytes:
         """Of a file of the set. Raises a FileError where it is larger than `limit` bytes."""
@@ -130,6 +137,23 @@ class Shards:
             files.write(path, content)
         else:  # objects appear whole
             self._files.pipe_file(path, content)
+
+
+def _place_of(url: str) -> tuple[Any, str]:
+    """The storage of a URL or of a folder, and the path in it. A folder may have any name.
+
+    Raises:
+        ValueError: the URL is not one of storage.
+        ImportError, OSError: as of fsspec.
+    """
+    scheme, address, path = url.partition("://")
+    if not address:
+        return LocalFileSystem(), str(Path(url).absolute())
+    if scheme not in _STORAGE or "::" in path:
+        raise ValueError(
+            f"{scheme}:// is no storage; give a folder, or a URL that begins with one of {', '.join(_STORAGE)}"
+        )
+    return fsspec.core.url_to_fs(url)
 
 
 def _name(number: int) -> str:

@@ -167,6 +167,53 @@ class Optimum extends Robot {
   }
 }
 
+/** The way to the goal for somebody who drives: a point of the optimum's path, a second beyond the one that is reached. */
+class Guide {
+  constructor(scenario) {
+    this.states = unpacked(scenario.best.x);
+    this.reached = 0; // never goes back, so that paths may cross themselves
+  }
+
+  point(k) {
+    const at = 8 * Math.min(k, this.states.length / 8 - 1);
+    return [this.states[at], this.states[at + 1]];
+  }
+
+  /** That point for a robot in state x. */
+  ahead(x) {
+    const distance = (k) => Math.hypot(this.point(k)[0] - x[0], this.point(k)[1] - x[1]);
+    const near = Array.from({ length: A_SECOND + 1 }, (_, i) => this.reached + i);
+    this.reached = near.reduce((best, k) => (distance(k) < distance(best) ? k : best));
+    return this.point(this.reached + A_SECOND);
+  }
+}
+
+const A_SECOND = Math.round(1 / DATA.dt); // control steps
+const LOOK_AHEAD = 15; // control steps that are computed ahead in one of the episode
+
+/** What an episode will cost if the policy takes over now: the cost so far, and nearly the least cost from here on. So it is never
+ * less than the optimum. It is computed in many small parts. */
+class Forecast {
+  constructor(robot, scenario) {
+    this.robot = robot;
+    this.policy = new Policy(DATA.policies[scenario.task], MODELS[scenario.task]);
+    this.cost = null; // where the policy does not reach the goal from here either, or nothing is computed yet
+    this.restart();
+  }
+
+  /** Begins where the robot is now. */
+  restart() {
+    this.ahead = Object.assign(Object.create(Robot.prototype), this.robot, { controller: this.policy, path: [] });
+  }
+
+  advance() {
+    for (let i = 0; i < LOOK_AHEAD && !this.ahead.over; i++) this.ahead.advance();
+    if (!this.ahead.over) return;
+    this.cost = this.ahead.failed ? null : this.ahead.cost;
+    this.restart();
+  }
+}
+
 const STEEPEST = 0.7; // rad, the lean that a stick commands that is fully out
 const STIFFNESS = 60; // 1/s², how a lean is brought to the commanded one
 const DAMPING = 14; // 1/s

@@ -83,7 +83,7 @@ class Replay extends Player {
       scene.camera.target = [...now.x.slice(0, 2), 0.5];
       const driven = [...take.x.slice(0, now.n + 1), now.x];
       const paths = [{ points: take.x, color: take.color, dashed: true }, { points: driven, color: take.color, dashed: false }];
-      scene.draw({ robots: [{ x: now.x, u: now.u, color: take.color, alpha: 1 }], paths, markers });
+      scene.draw({ robots: [{ x: now.x, yaw: now.x[4], u: now.u, color: take.color, alpha: 1 }], paths, markers });
     });
   }
 

@@ -1,0 +1,121 @@
+"""BallbotArrays: what `BallbotNative` does, in NumPy, for machines without a C compiler and without torch.
+
+It is several times slower, and the numbers are those of `BallbotNative` to rounding. Both share all that follows a step, so
+`BallbotNative` is checked against it before it is used.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import counter_rng, dynamics, ops
+from ballbot_gym.native import FLAG_ROWS, BallbotNative, Computed, State
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import outcome
+
+_REWARD, _COST, _SURVIVE, _RUNNING, _GOAL = range(5)  # rows of what is paid
+_TERMINATED, _TRUNCATED, _SUCCESS, _FAILURE, _CLIPPED, _DONE = range(FLAG_ROWS)
+
+
+class BallbotArrays(BallbotNative):
+    """A `BallbotNative` without machine code."""
+
+    compiled = False
+
+    def __init__(self, task: Task, num_envs: int, dtype: type[np.floating], params: BallbotParams):
+        """Makes the envs; arguments as of `BallbotNative`.
+
+        Raises:
+            ValueError: num_envs out of range.
+        """
+        super().__init__(task, num_envs, dtype, params, code=True)
+
+    def _start(self, which: np.ndarray, state: State, given: bool) -> None:
+        x, c = self._drawn(state.seed[which], state.episode[which], state.c[:, which] if given else None)
+        state.x[:, which], state.c[:, which] = x, c
+
+    def _drawn(self, seed: np.ndarray, episode: np.ndarray, c: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """The states and constants with which episodes start; the constants are drawn unless they are given."""
+        task, count = self.task, self.task.constant_draws
+        z = counter_rng.uniforms(counter_rng.key(seed, episode, 0), count + task.state_draws, self.dtype)
+        if c is None:
+            c = self._rows(task.draw_constants(z[:count], self.params), len(seed))
+        return self._rows(task.start(z[count:], tuple(c), self.params), len(seed)), c
+
+    def _rows(self, parts: Sequence[Any], size: int) -> np.ndarray:
+        """(n, B) of n components, of which some may be single numbers."""
+        rows = np.empty((len(parts), size), self.dtype)
+        for row, part in zip(rows, parts, strict=True):
+            row[:] = part
+        return rows
+
+    def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        x = tuple(state.x)
+        now = self.task.at(tuple(state.c), state.steps.astype(self.dtype) * self.dtype(self.task.control_dt))
+        seen = self._rows(ops.components(self.task.seen(x, now)), state.x.shape[1])
+        return seen, self._rows((dynamics.tilt(x),), state.x.shape[1])[0]
+
+    def _advanced(self, old: State, actions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """One control step: rows of states, tilts, forces and grip; pay; flags; and violated limits."""
+        task, params, size = self.task, self.params, self.num_envs
+        x, c, a = tuple(old.x), tuple(old.c), tuple(actions.T)
+        u = tuple(ops.clip(part, -1.0, 1.0) * params.force_limit for part in a)
+        end = dynamics.step(params, x, u, task.control_dt, dynamics.substeps_for(task.control_dt))
+        grip, held = (), ()
+        if params.grips:
+            floor = dynamics.held_contact(params, x, u, task.control_dt)
+            limits = [part for force in floor for part in dynamics.grip_limits(params, force)]
+            held = (np.minimum.reduce(np.broadcast_arrays(*limits)),)
+            grip = (*floor[0], np.maximum(*(dynamics.needed_friction(force) for force in floor)))
+        did = outcome(task, x, u, end, c, (old.steps + 1).astype(self.dtype), held)
+        survive = task.survival_reward * task.control_dt
+        reward = survive - did.running + did.goal
+        running = np.where(did.violated >= 0, reward - survive, -did.cost)
+        goal = np.where(did.success > 0, reward - survive - running, 0) if task.first_exit else 0.0
+        pay = np.empty((5, size))
+        for row, part in zip(pay, (reward, did.cost, survive, running, goal), strict=True):
+            row[:] = part
+        clipped = np.any([np.abs(part) > 1 for part in a], axis=0)
+        flags = np.empty((FLAG_ROWS, size), bool)
+        for row, part in zip(flags, (did.terminated, did.truncated, did.success, did.failure, clipped), strict=False):
+            row[:] = np.asarray(part) != 0
+        flags[_TRUNCATED] |= ~flags[_TERMINATED] & (old.steps + 1 >= self.most_steps)
+        flags[_DONE] = flags[_TERMINATED] | flags[_TRUNCATED]
+        rows = self._rows((*end, dynamics.tilt(end), *u, *grip), size)
+        return rows, pay, flags, np.asarray(did.violated, np.int64)
+
+    def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
+        finite = bool(np.isfinite(actions).all())
+        rows, pay, flags, violated = self._advanced(old, np.where(np.isfinite(actions), actions, 0))
+        steps, episode, c = old.steps + 1, old.episode.copy(), old.c.copy()
+        seen, _ = self._seen(old._replace(x=rows[: self.params.state_size], steps=steps))
+        last = np.ascontiguousarray(seen.T, np.float32)
+        if self.restarts:
+            rows = np.concatenate((rows, rows))
+            pay = np.concatenate((pay, pay[_COST:]))
+            flags = np.concatenate((flags, flags[_SUCCESS : _CLIPPED + 1]))
+        begins = np.zeros(self.num_envs, bool)
+        if self.restarts:
+            begins |= flags[_DONE]
+            pay[_COST : _GOAL + 1, begins] = 0
+            flags[_SUCCESS : _CLIPPED + 1, begins] = False
+        if waiting is not None:
+            begins |= waiting
+            pay[: _GOAL + 1, waiting] = 0
+            flags[: _DONE + 1, waiting] = False
+            violated[waiting] = -1
+        begun = np.flatnonzero(begins)
+        if begun.size:
+            tilt = self.params.state_size
+            rows[tilt + 1 : self._told_rows, begun] = 0
+            steps[begun], episode[begun] = 0, episode[begun] + 1
+            x, c[:, begun] = self._drawn(old.seed[begun], episode[begun], None)
+            rows[:tilt, begun] = x
+            started = old._replace(x=x, c=c[:, begun], steps=steps[begun])
+            seen[:, begun], rows[tilt, begun] = self._seen(started)
+        return (rows, seen, pay, flags, np.array((violated, steps, episode)), c, last), not finite
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)

@@ -1,0 +1,126 @@
+"""What a picture of ballbots shows, as plain data that every renderer draws: robots, ghosts, markers, paths and forces.
+
+A `Drawing` is one moment. Films, strips of pictures and live pages draw one after the other. Nothing here knows a library
+that draws.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks.marker import Marker
+
+BALL = "#292e3b"
+"""Colour of the ball."""
+BODY = "#d97706"
+"""Colour of a body that stands for no controller."""
+FORCE = "#d91a8c"
+"""Colour of the force's arrow."""
+PUSH = "#1a9e5c"
+"""Colour of a push's arrow."""
+GOAL = "#1f6fb2"
+"""Colour of the arrow to the goal of a drive."""
+GHOST_OPACITY = 0.4
+FORCE_SCALE = 1 / 400
+"""Length of the force's arrow, m/N."""
+PUSH_SCALE = 1 / 130
+"""Length of a push's arrow, m/(N·s)."""
+LEAST_FORCE = 2.0
+"""N: smaller forces get no arrow."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A ballbot: state x (8,), colour "#rrggbb", force u (2,), N, or None for no arrow, and opacity, less than 1 for ghosts.
+
+    `push` (2,), N·s, is an impulse on the body's centre of mass, drawn as an arrow, or None. `label` is what a live page
+    writes above it.
+    """
+
+    x: np.ndarray
+    color: str = BODY
+    u: np.ndarray | None = None
+    alpha: float = 1.0
+    push: np.ndarray | None = None
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class GroundPath:
+    """A line on the floor through points (n, 2), m: where a robot was, or dashed, a ring. Its colour is as of a robot or
+    as of a marker.
+    """
+
+    points: np.ndarray
+    color: str | tuple[float, ...]
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One moment. The robot that matters most is the last one. Of it a renderer's camera keeps `centre` in view."""
+
+    params: BallbotParams
+    robots: tuple[Robot, ...]
+    paths: tuple[GroundPath, ...] = ()
+    markers: tuple[Marker, ...] = ()
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(2,) where the last robot is, m; the origin if there is no robot."""
+        return self.robots[-1].x[:2] if self.robots else np.zeros(2)
+
+    @property
+    def lines(self) -> tuple[GroundPath, ...]:
+        """The rings of markers, then the paths."""
+        rings = (GroundPath(_ring(marker), marker.color, True) for marker in self.markers if marker.ring)
+        return *rings, *self.paths
+
+    @property
+    def posts(self) -> tuple[Marker, ...]:
+        """The other markers."""
+        return tuple(marker for marker in self.markers if not marker.ring)
+
+
+class Pose(NamedTuple):
+    """Where a ballbot's parts are, m. The body is a cylinder about the axis from `body` to `top`."""
+
+    ball: np.ndarray
+    """(3,) centre of the ball."""
+    body: np.ndarray
+    """(3,) centre of the body."""
+    top: np.ndarray
+    """(3,) upper end of the body."""
+
+
+def pose(params: BallbotParams, x: np.ndarray) -> Pose:
+    """The pose of a ballbot in state x (8,). γ turns the body about the y axis, then θ about the turned −x axis."""
+    ball = np.array([x[0], x[1], params.ball_radius])
+    gamma, theta = x[2], x[3]
+    axis = np.array([math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)])
+    body = ball + params.com_height * axis
+    return Pose(ball, body, body + params.body_length / 2 * axis)
+
+
+def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
+    """Colour, and start and end (3,), m, of the arrows of a robot's force and push, where there is one to draw.
+
+    The forces of three wheels have no one direction, and get none.
+
+    The force's starts at the ball's centre, and the push's at the body's centre of mass, as of `pose`.
+    """
+    drawn = ((FORCE, robot.u, FORCE_SCALE, LEAST_FORCE, place.ball), (PUSH, robot.push, PUSH_SCALE, 0.0, place.body))
+    return [
+        (color, (at, at + scale * np.array([*part, 0.0])))
+        for color, part, scale, least, at in drawn
+        if part is not None and len(part) == 2 and math.hypot(*part) > least
+    ]
+
+
+def _ring(marker: Marker) -> np.ndarray:
+    """(n, 2) points, m, of a marker's circle."""
+    angles = np.linspace(0, 2 * math.pi, 97)
+    return marker.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) + np.array(marker.position)

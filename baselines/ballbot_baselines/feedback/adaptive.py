@@ -1,0 +1,112 @@
+"""Controllers behind a filter: for robots, delays and sensors that nobody told them.
+
+`TrackFilter` estimates the state, the robot and the delay, and `SensorFilter` the state of a robot with wheels. A controller
+acts on the state in which its force will begin to act, and asks for what makes up for the share of it that the robot applies.
+NMPC is told the estimated robot too. Where the estimate has moved far from the robot that the episode was planned for, the
+rest of the episode is planned anew, from the present state. That takes longer than a control step. Shortly before a goal a
+new plan may just miss it, and go all the way round. The plan before, which tolerates some error, is followed then.
+
+What friction the floor has is not seen before the robot slips, so plans take the least of the track.
+"""
+
+import contextlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ballbot_baselines.feedback.kalman import SensorFilter, TrackFilter
+from ballbot_baselines.feedback.nmpc import BACKOFF, NmpcController
+from ballbot_baselines.solvers.shooting import Backoff
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import TRACKS
+from ballbot_gym.rollout import Controller, PlanError
+from ballbot_gym.tasks import Task
+
+_MOVED = 0.02  # of a factor of the robot, and at least twice its deviation: then the episode is planned anew
+_LATER = 1.0  # s by which plans that go all the way round to a goal end later, and are not followed
+_NOISY_BACKOFF = Backoff(margin=0.03, goal=0.2, force=0.02, grip=0.1)  # with room for errors of the estimate
+
+_TRACKS = {
+    "-adaptive-ekf": TRACKS["real"],
+    "-ekf": TRACKS["noisy"],
+    "-adaptive": replace(TRACKS["unknown"], actuator_delay=TRACKS["late"].actuator_delay),
+}
+"""What each of `FILTERS` takes for possible."""
+
+
+class FilteredController:
+    """A controller that acts on what `filter` estimates, which is the filter that one of `FILTERS` names.
+
+    With wheels "-ekf" makes the state from sensors. Every other filter knows what may vary on a track, and how far. Then it
+    acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, ending: str, controller: Controller):
+        self._task, self._params, self._controller = task, params, controller
+        self.senses = params.wheels is not None and ending == "-ekf"
+        self.filter = SensorFilter(task, params) if self.senses else TrackFilter(task, params, _TRACKS[ending])
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._c, self._start = c, t
+        self.filter.reset(x, c)
+        self._begin(t)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        if t > self._start:
+            self.filter.update(t - self._start, x, self._u)
+            self._adapt(t)
+        limit = self._params.force_limit
+        # the robot applies a share of what it is asked for
+        u = self._controller.act(self._when_free(t), self.filter.when_free()) / self.filter.factors[..., 2:]
+        self._u = np.clip(u, -limit, limit)
+        return self._u
+
+    def _begin(self, t: float) -> None:
+        self._adapt(t)
+        self._controller.reset(self._when_free(t), self.filter.when_free(), self._c)
+
+    def _adapt(self, t: float) -> None:
+        """Tells the controller what is known now of the robot."""
+        if getattr(self._controller, "told", None) is not None:
+            self._controller.told = self.filter.factors  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _when_free(self, t: float) -> Any:
+        """When the next command will begin to act, s; (B,) of B episodes."""
+        return t + self._task.control_dt * self.filter.delay
+
+
+class AdaptiveNmpcController(FilteredController):
+    """NMPC for a track: `filter` estimates what was drawn, and it plans with that."""
+
+    filter: TrackFilter
+    _controller: NmpcController
+
+    def __init__(self, task: Task, params: BallbotParams, ending: str):
+        self._backoff = BACKOFF if ending == "-adaptive" else _NOISY_BACKOFF
+        super().__init__(task, params, ending, NmpcController(task, params, backoff=self._backoff))
+
+    def _begin(self, t: float) -> None:
+        self._controller = self._planned(t)
+
+    def _adapt(self, t: float) -> None:
+        moved = np.abs(self.filter.factors - self._factors) > np.maximum(_MOVED, 2 * self.filter.deviations)
+        if self.filter.delay != self._delay or moved.any():
+            with contextlib.suppress(PlanError):  # the plan before is followed
+                planned = self._planned(t)
+                if _end(planned) < _end(self._controller) + _LATER:
+                    self._controller = planned
+        self._controller.adapt(self.filter.robot)
+
+    def _planned(self, t: float) -> NmpcController:
+        """NMPC for the estimated robot, with a plan of the rest of the episode from where the next force begins to act."""
+        self._factors, self._delay = self.filter.factors, self.filter.delay
+        nmpc = NmpcController(self._task, self.filter.robot, backoff=self._backoff)
+        nmpc.reset(self._when_free(t), self.filter.when_free(), self._c)
+        return nmpc
+
+
+def _end(nmpc: NmpcController) -> float:
+    """When its plan ends, s."""
+    assert nmpc.plan is not None
+    return nmpc.plan.trajectory.t[-1]

@@ -1,0 +1,323 @@
+"""Extended Kalman filters: for what a track does not tell, and for the state of a robot with wheels from its sensors.
+
+`TrackFilter` estimates z = (x, factors of body mass, height of the centre of mass and force, odometry's drift, biases of
+leans and of lean rates), which is 17 numbers, on a track that varies them. Its model is the env's control step, and its
+Jacobian is CasADi's. What sensors report is linear in z. How far each number may be from what is expected, and how noisy
+sensors are, is the track's: a number that the track does not vary stays what it is.
+
+A delay is whole control steps, so there is one filter for each delay that the track may draw. The one whose predictions were
+likeliest is believed.
+
+`SensorFilter` estimates the state and the gyroscope's biases, which is 14 numbers, from what `ballbot_gym.sensors` shows.
+Readings are of a control step as a whole, so they correct the state in which the step began, and from there the model goes
+on. Before the first of them the filter expects what the task draws, at the place where the episode begins.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import casadi
+import gymnasium
+import numpy as np
+
+from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
+from ballbot_gym import dynamics, sensors
+from ballbot_gym.env import BallbotEnv
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
+from ballbot_gym.tasks import Task
+
+_X, _FACTORS = slice(0, 8), slice(8, 11)
+_SIZE = 17
+_WIDE = 10.0  # standard deviation of the state before it is first observed, SI units
+_LEAST_NOISE = 1e-4  # of sensors, SI units: no filter converges on exact ones
+_MODEL_ERROR = (1e-4,) * 4 + (1e-3,) * 4  # of the state per control step, SI units: what no robot of the track explains
+_FACTOR_WALK = 1e-3  # per control step: lets factors recover from errors of the linearization
+_EVIDENCE = 3.0  # of a longer delay over a shorter one, as a difference of log-likelihoods
+
+
+class TrackFilter:
+    """Estimates what a track does not tell, from reported states and commanded forces, in one episode or in B at once.
+
+    | attribute | shape | meaning |
+    |---|---|---|
+    | `x` | (8,), or (B, 8) as that of `reset` | the state |
+    | `factors` | (..., 3) | on the nominal values of what `ROBOT_FACTORS` names |
+    | `covariance` | (..., 17, 17) | of all that is estimated |
+    | `deviations` | (..., 3) | standard deviations of `factors` |
+    | `delay` | (...) | control steps from a command to its force |
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, track: Randomization):
+        if params.wheels is not None:
+            raise ValueError(
+                "what a track does not tell is not estimated of a robot with wheels; give lqr, trajopt or nmpc"
+            )
+        self._params, self._track, self._dt = params, track, task.control_dt
+        low, high = track.delay_steps(task.control_dt)
+        self._delays = np.arange(low, high + 1)
+        self._low, self._high = np.array([getattr(track, name) for name in ROBOT_FACTORS]).T
+        errors = np.repeat((track.odometry_drift, track.lean_bias, track.lean_rate_bias), 2)
+        self._prior = np.concatenate([np.full(8, _WIDE), (self._high - self._low) / np.sqrt(12), errors]) ** 2
+        self._walk = np.array([*_MODEL_ERROR, *[_FACTOR_WALK] * 3, *[0] * 6]) ** 2
+        self._noise = np.diag(np.maximum(track.noise, _LEAST_NOISE)) ** 2
+
+    def reset(self, x: np.ndarray, c: np.ndarray | None = None) -> None:
+        """Starts an episode, of which sensors report state x (8,) at first, or B episodes (B, 8); c does not matter."""
+        one_for_each = (*x.shape[:-1], len(self._delays))
+        calls = -(-int(np.prod(one_for_each)) // LANES)
+        count = calls * LANES
+        self._before, self._held = np.zeros((count, _SIZE)), np.zeros((count, 2))
+        self._after, self._slopes = np.zeros((count, 8)), np.zeros((count, _SIZE, 8))
+        step = _step_function(self._params, self._dt).map(calls)
+        self._step = InPlace(step, [self._before, self._held], [self._after, self._slopes])
+        middle = np.concatenate([np.zeros(8), (self._low + self._high) / 2, np.zeros(6)])
+        self._z, self._p = np.tile(middle, (*one_for_each, 1)), np.tile(np.diag(self._prior), (*one_for_each, 1, 1))
+        self._z[..., _X] = x[..., None, :]
+        self._likelihood = np.zeros(one_for_each)
+        self._best = np.zeros(x.shape[:-1], np.int64)
+        self._commands = [np.zeros((*x.shape[:-1], 2))] * (self._delays[-1] + 1)  # the latest first
+        self._correct(x, 0.0)
+
+    def update(self, t: float, x: np.ndarray, u: np.ndarray) -> None:
+        """Takes the reported state x (..., 8) at the episode's time t, s, and the force u (..., 2), N, asked for before."""
+        self._commands = [np.asarray(u, np.float64), *self._commands[:-1]]
+        forces = np.stack([self._commands[delay] for delay in self._delays], -2)
+        count = self._likelihood.size
+        self._before[:count], self._held[:count] = self._z.reshape(-1, _SIZE), forces.reshape(-1, 2)
+        self._step()
+        slopes = self._slopes[:count].swapaxes(-1, -2).reshape(*forces.shape[:-1], 8, _SIZE)
+        # Factors multiply each other: what they move x by is wrong by about the share that they are uncertain by.
+        of_factors, moved = self._p[..., _FACTORS, _FACTORS], slopes[..., _FACTORS]
+        share = np.trace(of_factors, axis1=-2, axis2=-1)[..., None]
+        second_order = share * np.einsum("...ij,...jl,...il->...i", moved, of_factors, moved)
+        self._z[..., _X] = self._after[:count].reshape(*forces.shape[:-1], 8)
+        self._p[..., _X, :] = slopes @ self._p
+        self._p[..., _X] = self._p @ slopes.swapaxes(-1, -2)
+        spread = np.diagonal(self._p, axis1=-2, axis2=-1)
+        index = np.arange(_SIZE)
+        self._p[..., index, index] += np.where(spread < self._prior, self._walk, 0.0)
+        self._p[..., index[_X], index[_X]] += second_order
+        self._likelihood += self._correct(x, t)
+        likely = self._likelihood >= self._likelihood.max(-1, keepdims=True) - _EVIDENCE
+        self._best = np.argmax(likely, -1)
+
+    def _correct(self, x: np.ndarray, t: float) -> np.ndarray:
+        """Corrects all filters by what sensors report, and says how likely each found it."""
+        h = np.eye(8, _SIZE)
+        h[range(8), [11, 12, 13, 14, 11, 12, 15, 16]] = [t, t, 1, 1, 1, 1, 1, 1]
+        missed = np.asarray(x, np.float64)[..., None, :] - self._z @ h.T
+        self._z, self._p, spread = _corrected(self._z, self._p, h, missed, self._noise)
+        self._z[..., _FACTORS] = np.clip(self._z[..., _FACTORS], self._low, self._high)
+        whitened = np.einsum("...i,...i->...", missed, np.linalg.solve(spread, missed[..., None])[..., 0])
+        return -0.5 * (whitened + np.linalg.slogdet(spread)[1])
+
+    def _believed(self, each: np.ndarray) -> np.ndarray:
+        """What the believed filter has of what each filter has (..., filters, n)."""
+        return np.take_along_axis(each, self._best[..., None, None], -2)[..., 0, :]
+
+    @property
+    def x(self) -> np.ndarray:
+        return self._believed(self._z)[..., _X]
+
+    @property
+    def factors(self) -> np.ndarray:
+        return self._believed(self._z)[..., _FACTORS]
+
+    @property
+    def covariance(self) -> np.ndarray:
+        return np.take_along_axis(self._p, self._best[..., None, None, None], -3)[..., 0, :, :]
+
+    @property
+    def deviations(self) -> np.ndarray:
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)[..., _FACTORS])
+
+    @property
+    def delay(self) -> np.ndarray:
+        return self._delays[self._best]
+
+    def when_free(self) -> np.ndarray:
+        """The state (..., 8) in which the next command will begin to act."""
+        x, share = self.x, self.factors[..., 2:]
+        robot = self.robot
+        for age in range(self._delays[-1], 0, -1):  # of commands that have not begun to act, the earliest first
+            if (waits := self.delay >= age).any():
+                forces = share * self._commands[age - 1]
+                after = dynamics.step(robot, x, forces, self._dt, dynamics.substeps_for(self._dt))
+                x = np.where(waits[..., None], after, x)
+        return x
+
+    @property
+    def robot(self) -> BallbotParams:
+        """The estimated robot, on the slipperiest floor of the track; of B episodes its numbers are (B,)."""
+        mass, height, force = self.factors.T if self.factors.ndim > 1 else self.factors.tolist()
+        return self._track.robot(self._params, (mass, 1.0, height, 1.0, 1.0, 0.0, force, self._track.friction[0]))
+
+
+@lru_cache(maxsize=16)
+def _step_function(params: BallbotParams, dt: float) -> casadi.Function:
+    """(z, commanded force) -> x after a control step of dt, s, in which the force acts, and its Jacobian (8, 17) as a column;
+    of `LANES` filters at once.
+    """
+    z, u = casadi.SX.sym("z", _SIZE), casadi.SX.sym("u", 2)
+    mass, height, force = (z[8 + i] for i in range(3))
+    robot = Randomization().robot(params, (mass, 1.0, height, 1.0))
+    x = dynamics.step(robot, z[_X], force * u, dt, dynamics.substeps_for(dt))
+    slopes = casadi.vec(casadi.densify(casadi.jacobian(x, z)))
+    return in_lanes("filter", (casadi.Function("step", [z, u], [x, slopes], {"cse": True}),))[0]
+
+
+def _corrected(
+    z: np.ndarray, p: np.ndarray, h: np.ndarray, missed: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Estimates z (..., n) and covariances (..., n, n), corrected by what h (m, n) missed (..., m), with its noise (m, m).
+
+    The third is the covariance (..., m, m) that was expected of what was missed.
+    """
+    spread = h @ p @ h.T + noise
+    gain = np.linalg.solve(spread, h @ p).swapaxes(-1, -2)
+    kept = np.eye(z.shape[-1]) - gain @ h
+    p = kept @ p @ kept.swapaxes(-1, -2) + gain @ noise @ gain.swapaxes(-1, -2)
+    return z + np.einsum("...ij,...j->...i", gain, missed), p, spread
+
+
+_DRAWN = 256  # starts that tell what to expect of one
+_KNOWN = 1e-3  # standard deviation of what they all share, SI units
+
+
+class SensorFilter:
+    """Estimates the state `x` (11,) of a robot with wheels from its sensors and the forces of its wheels.
+
+    The robot and its delay are known: `factors` and `delay` are as of a `TrackFilter` that has nothing to estimate.
+
+    | attribute | shape | meaning |
+    |---|---|---|
+    | `model` | | CasADi function of the state and the wheels' forces; see below |
+    | `model_variance` | (14,) | what the model does not explain, per control step |
+    | `reading_variance` | (9,) | the noise of what sensors read over a control step |
+
+    `model` takes x (11,) and u (3,), N. It returns the rates of x over ideal readings (9,), and their Jacobian (20, 11) with
+    respect to x.
+    """
+
+    factors, delay = np.ones(3), 0
+    model_variance = np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
+
+    def __init__(self, task: Task, params: BallbotParams):
+        self._task, self._params, self._dt = task, params, task.control_dt
+        self.model, (self._after, self._over_step) = _robot_and_sensors(params), _control_step(params, task.control_dt)
+        samples = sensors.samples(task.control_dt)
+        noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
+        self.reading_variance = np.array([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        self._noise = np.diag(self.reading_variance)
+
+    def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
+        """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
+        mean, deviations = self.expected_start(c)
+        self._z, self._p = np.concatenate([seen[9:11], mean[2:]]), np.diag(deviations) ** 2
+        found, slopes = self.model(self._z[:11], np.zeros(3))
+        self._correct(seen, found[11:], slopes[11:, :])
+
+    def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
+        """Takes what sensors show (no,) at the time t, s, after a control step with the wheels' forces u (3,), N."""
+        u = np.clip(u, -self._params.force_limit, self._params.force_limit)
+        self._correct(seen, *self._over_step(self._z[:11], u))
+        after, slopes = self._after(self._z[:11], u)
+        self._z[:11], slopes = np.array(after)[:, 0], np.array(slopes)
+        self._p[:11] = slopes @ self._p[:11]
+        self._p[:, :11] = self._p[:, :11] @ slopes.T
+        self._p += np.diag(self.model_variance)
+
+    def expected_start(self, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is expected (14,) where an episode with constants c (nc,) begins, and its standard deviations."""
+        draws = np.random.default_rng(0).random((_DRAWN, self._task.state_draws))
+        starts = np.array([self._task.start(tuple(z), tuple(c), self._params) for z in draws.tolist()])
+        starts[:, :2] = 0.0  # which sensors report
+        deviations = [*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]
+        return np.concatenate([starts.mean(0), np.zeros(3)]), np.array(deviations)
+
+    def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
+        """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
+        of_biases, turned = np.eye(9, 3), np.repeat([1.0, self._dt], (6, 3))
+        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - turned * np.array(expected)[:, 0]
+        missed[:3] -= self._z[11:]
+        h = np.hstack([turned[:, None] * np.array(slopes), of_biases])
+        self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
+
+    @property
+    def x(self) -> np.ndarray:
+        return self._z[:11].copy()
+
+    def when_free(self) -> np.ndarray:
+        """The state (11,) in which the next command will act, which is the present one."""
+        return self.x
+
+
+class StateFromSensors(gymnasium.Wrapper):
+    """Shows a policy the observation of the state that `SensorFilter` estimates, in an env that shows sensors."""
+
+    def __init__(self, env: gymnasium.Env):
+        """Args: env: a `BallbotEnv` with observation="sensors" and without history, wrapped or not."""
+        super().__init__(env)
+        ballbot: Any = env.unwrapped
+        if not isinstance(ballbot, BallbotEnv) or ballbot.observation != "sensors" or ballbot.history:
+            raise ValueError('StateFromSensors takes a BallbotEnv with observation="sensors" and without history')
+        self._task = ballbot.task
+        self.observation_space = sensors.observation_space(ballbot.task, ballbot.params)
+        self.filter = SensorFilter(ballbot.task, ballbot.params)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        seen, info = self.env.reset(seed=seed, options=options)
+        self.filter.reset(seen, info["constants"])
+        self._steps = 0
+        return self._state(info), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        self._steps += 1
+        self.filter.update(self._steps * self._task.control_dt, seen, info["force"])
+        return self._state(info), reward, terminated, truncated, info
+
+    def _state(self, info: dict[str, Any]) -> np.ndarray:
+        c = self._task.at(info["constants"], self._steps * self._task.control_dt)
+        return np.array(self._task.seen(self.filter.x, c), np.float32)
+
+
+@lru_cache(maxsize=16)
+def _robot_and_sensors(params: BallbotParams) -> casadi.Function:
+    """(x, u) -> rates of the state x (11,) over ideal readings (9,), under the wheels' forces u (3,), N, and their Jacobian
+    (20, 11) with respect to x.
+    """
+    x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
+    state, forces = tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(u))
+    found = casadi.vertcat(*dynamics.derivative(params, state, forces), *sensors.ideal(params, state, forces))
+    return casadi.Function("robot", [x, u], [found, casadi.densify(casadi.jacobian(found, x))], {"cse": True})
+
+
+@lru_cache(maxsize=16)
+def _control_step(params: BallbotParams, dt: float) -> tuple[casadi.Function, casadi.Function]:
+    """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives
+    its Jacobian with respect to x too.
+    """
+    model, substeps = _robot_and_sensors(params), dynamics.substeps_for(dt)
+    x, u, own = casadi.MX.sym("x", 11), casadi.MX.sym("u", 3), casadi.DM.eye(11)
+    after, slopes, h = x, own, dt / substeps
+    for _ in range(substeps):
+        rates, changes, more, moved = casadi.MX(11, 1), casadi.MX(11, 11), after, slopes
+        for weight, share in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
+            found, at = model(more, u)
+            rate, change = found[:11], at[:11, :] @ moved
+            rates, changes = rates + weight / 6 * rate, changes + weight / 6 * change
+            more, moved = after + share * h * rate, slopes + share * h * change
+        after, slopes = after + h * rates, slopes + h * changes
+    (first, at_first), (last, at_last) = model(x, u), model(after, u)
+    at_last = at_last @ slopes
+    halfway, at_halfway = model(0.5 * (x + after) + dt / 8 * (first - last)[:11], u)
+    at_halfway = at_halfway @ (0.5 * (own + slopes) + dt / 8 * (at_first - at_last)[:11, :])
+    read, of_read = first + 4 * halfway + last, at_first + 4 * at_halfway + at_last
+    return (
+        casadi.Function("after", [x, u], [after, slopes]),
+        casadi.Function("over", [x, u], [read[11:] / 6, of_read[11:, :] / 6]),
+    )

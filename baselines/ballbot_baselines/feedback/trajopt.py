@@ -1,0 +1,49 @@
+"""Trajectory optimization as a controller: plan at reset, track with TVLQR."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ballbot_baselines.feedback.tvlqr import TvlqrController
+from ballbot_baselines.optimum.find import plan_to_track
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.solvers.shooting import Backoff
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import TRACKS
+from ballbot_gym.tasks import Task
+
+EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02, grip=0.1)
+"""How far plans for execution stay from their limits: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the
+force, a tenth of the weight in normal force, where friction is limited."""
+
+_LEAST_FORCE, _LEAST_FRICTION = TRACKS["unknown"].force[0], TRACKS["unknown"].friction[0]
+# A robot that differs from the model misses its plan: half of the goal's tolerance and 3 cm are left for that.
+_CAUTIOUS = Backoff(margin=0.03, goal=0.5, force=1 - _LEAST_FORCE, grip=0.1)
+
+
+class TrajoptController:
+    """Plans the optimum from the state at reset, with a back-off from the limits, and tracks it with TVLQR.
+
+    A plan that is feasible and not optimal is tracked too. `plan` is the last plan. `reset` raises a PlanError if it finds no
+    plan.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
+        self._task, self._params, self._backoff = task, params, backoff
+        self.plan: Optimum | None = None
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self.plan = plan_to_track(self._task, self._params, x, c, self._backoff, start=t)
+        self._tracker = TvlqrController.for_task(self._task, self._params, self.plan.trajectory, c)
+        self._tracker.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        return self._tracker.act(t, x)
+
+
+def cautious_trajopt(task: Task, params: BallbotParams) -> TrajoptController:
+    """`TrajoptController` for the nominal robot with the least force and friction of the track "unknown".
+
+    Its plans leave force and room for feedback on all robots of that track.
+    """
+    return TrajoptController(task, replace(params, friction=params.friction * _LEAST_FRICTION), _CAUTIOUS)

@@ -1,0 +1,56 @@
+"""Time-varying LQR that keeps the robot on a planned trajectory."""
+
+import numpy as np
+
+from ballbot_baselines.solvers.riccati import Gains, held_steps, lqr_at_end, tracking_gains
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
+
+
+class TvlqrController:
+    """Tracks a trajectory sampled at control steps: u = u_k − K_k (x − x_k).
+
+    Past the trajectory's end its last state is held by the last gain, which is LQR's where that state is an equilibrium.
+    """
+
+    def __init__(self, trajectory: Trajectory, dt: float, gains: Gains, end_gain: np.ndarray | None = None):
+        """Takes the gains.
+
+        Args:
+            trajectory: what to track.
+            dt: s, the control step.
+            gains: for each of the trajectory's n steps.
+            end_gain: (2, 8) for what comes after the end; default, the last of the trajectory's.
+        """
+        self.x, self.u = held_steps(trajectory, dt)
+        self.gains = gains
+        self._end, self._end_gain = trajectory.x[-1], gains.k[-1] if end_gain is None else end_gain
+        self._dt, self._start = dt, 0.0
+
+    @classmethod
+    def for_task(
+        cls,
+        task: Task,
+        params: BallbotParams,
+        trajectory: Trajectory,
+        c: np.ndarray | tuple = (),
+        end: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> "TvlqrController":
+        """With weights from the task's own cost; c (nc,) are the constants the trajectory was planned for.
+
+        Its times are the episode's. `end` is K (2, 8) and P (8, 8) where it ends; default, those of `lqr_at_end`.
+        """
+        c, dt = np.asarray(c, np.float64), task.control_dt
+        end_gain, p_final = end or lqr_at_end(task, params, trajectory.x[-1], c, trajectory.t[-1])
+        gains = tracking_gains(task, params, *held_steps(trajectory, dt), c, p_final, trajectory.t[0])
+        return cls(trajectory, dt, gains, end_gain)
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._start = t
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        i = round((t - self._start) / self._dt)
+        if i < len(self.x):
+            return self.u[i] - self.gains.k[i] @ (x - self.x[i])
+        return -self._end_gain @ (x - self._end)

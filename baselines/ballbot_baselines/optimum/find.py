@@ -1,0 +1,176 @@
+"""The optimum of any episode of any task, on the env's own discretization (`shooting.py`).
+
+An episode under physics="rk4" that follows the optimal trajectory returns minus its cost. There are two searches, because
+each finds what the other misses. `search.py` solves one episode by multiple shooting, from each of the task's guessed paths,
+and from simulated recoveries where no path leads to a solution. `batched.py` solves thousands together by iLQR, from other
+guesses. The best solution is kept. It is feasible and locally optimal. It is the global optimum if one of the guesses leads
+there. What regrets are measured against is searched `twice`, by both.
+"""
+
+import math
+import time
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ballbot_baselines.optimum import batched
+from ballbot_baselines.optimum.guesses import CONSIDERED
+from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.optimum.search import attempts
+from ballbot_baselines.solvers.ocp import Solution
+from ballbot_baselines.solvers.riccati import tube_gains
+from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_gym.checks import finite_array
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import checked_robot
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
+
+_NO_CHEAPER = 1e-6  # relative
+_RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
+
+
+def find_optimum(
+    task: str | Task,
+    params: str | BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff = Backoff(),
+    guesses: int = CONSIDERED,
+    paths: list[np.ndarray] | None = None,
+    start: float = 0.0,
+    twice: bool | Optimum = False,
+) -> Optimum:
+    """The cheapest episode from state x0 with constants c.
+
+    Args:
+        task: the problem, or its name in `TASKS`.
+        params: the robot, or its name in `ROBOTS`.
+        x0: (8,) initial state, m, rad, m/s, rad/s; order in `dynamics.STATE`; (11,) with wheels.
+        c: (nc,) constants of the episode, named in the task's `constant_names`; (0,) where it has none.
+        backoff: distance kept from limits; none for the true optimum.
+        guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
+            those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
+        paths: ground paths to start from instead of the task's, (n+1, 2) each, m, one point for each control step.
+        start: the episode's time at x0, s: the trajectory's times begin there. It matters to tasks with a clock.
+        twice: whether the search of many episodes at once searches too, where it can, or what `find_optima` found for this
+            episode. It starts from other guesses, and finds something cheaper in about one episode of a hundred.
+
+    Returns:
+        The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
+
+    Raises:
+        PlanError: no try came to a feasible episode.
+        ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
+    """
+    task, params = make_task(task, params), checked_robot(params)
+    x0, c = finite_array(x0, (params.state_size,), "x0"), finite_array(c, (len(task.constant_names),), "c")
+    episode = Shooting(task, params, x0, c, backoff, start)
+    started = time.perf_counter()
+    tried: list[Solution] = []
+    for found in attempts(episode, guesses, paths):
+        tried += found
+        if any(solution.is_optimal for solution in found):
+            break
+    second = twice if isinstance(twice, Optimum) else None
+    if twice is True:
+        (second,) = batched.search_many(task, params, x0[None], c[None], backoff) or [None]
+    if second is not None:
+        tried += _cheaper(episode, second, min((s.cost for s in tried if s.is_optimal), default=math.inf))
+    within = [solution for solution in tried if solution.is_within_limits]
+    # optima come before feasible episodes, and cheap ones before expensive ones
+    best = min(within, key=lambda solution: (not solution.success, solution.cost), default=None)
+    if best is None:
+        tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for s in tried)
+        raise PlanError(
+            f"{task.id}: no feasible episode from x = {episode.x0.tolist()}, c = {episode.c.tolist()} ({tries})"
+        )
+    t = start + task.control_dt * np.arange(len(best.states))
+    trajectory = Trajectory(t, best.states, params.force_limit * best.inputs)
+    return Optimum.of(
+        best,
+        trajectory,
+        time.perf_counter() - started,
+        slopes=best.slopes,
+        markers=tuple(task.markers(c)),
+        feedback=partial(tube_gains, task, params, trajectory, c),
+    )
+
+
+def find_optima(
+    task: str | Task,
+    params: str | BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff = Backoff(),
+    guesses: int = CONSIDERED,
+) -> list[Optimum | None]:
+    """The cheapest episodes from B states x0 with constants c, thousands at once on one core: `find_optimum` for many.
+
+    They are solved together where C code can be compiled, and the task has no clock, and the robot no wheels. That takes a
+    few milliseconds each, and leaves some episodes unsolved, which `find_optimum` may solve. Elsewhere `find_optimum` solves
+    one after the other.
+
+    Args:
+        task: the problem, or its name in `TASKS`.
+        params: the robot, or its name in `ROBOTS`.
+        x0: (B, 8) initial states; (B, 11) with wheels.
+        c: (B, nc) constants; (B, 0) where the task has none.
+        backoff: distance kept from limits; none for the true optimum.
+        guesses: how many of the task's guessed paths to solve at most where episodes are solved one after the other.
+
+    Returns:
+        The optimum of each episode; None where no search converged.
+
+    Raises:
+        ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
+    """
+    task, params = make_task(task, params), checked_robot(params)
+    x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
+    for name, array, width in (("x0", x0, params.state_size), ("c", c, len(task.constant_names))):
+        if array.ndim != 2 or array.shape != (len(x0), width):
+            count = "B" if name == "x0" else len(x0)
+            raise ValueError(f"{name} must have the shape ({count}, {width}), not {array.shape}")
+    together = batched.search_many(task, params, x0, c, backoff)
+    if together is not None:
+        return together
+    found: list[Optimum | None] = []
+    for state, constants in zip(x0, c, strict=True):
+        try:
+            optimum = find_optimum(task, params, state, constants, backoff, guesses)
+            found.append(optimum if optimum.is_optimal else None)
+        except PlanError:
+            found.append(None)
+    return found
+
+
+def _cheaper(episode: Shooting, found: Optimum, cost: float) -> list[Solution]:
+    """Solutions from another search's optimum, if that is cheaper."""
+    if found.cost > cost * (1 - _NO_CHEAPER):
+        return []
+    trajectory = found.trajectory
+    return episode.solve_to_the_end(trajectory.x, trajectory.u / episode.params.force_limit, near=True)
+
+
+def plan_to_track(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
+) -> Optimum:
+    """As `find_optimum`, for feedback to track. Where no plan keeps the whole reserve of force and friction, it keeps less.
+
+    Args: as of `find_optimum`.
+
+    Raises:
+        PlanError: no try came to a feasible episode.
+    """
+    parts = [backoff.times(share) for share in _RESERVES]
+    tries = [replace(backoff, force=part.force, grip=part.grip if params.grips else backoff.grip) for part in parts]
+    *more, last = dict.fromkeys(tries)
+    for reserve in more:
+        try:
+            return find_optimum(task, params, x0, c, reserve, start=start)
+        except PlanError:
+            pass
+    return find_optimum(task, params, x0, c, last, start=start)

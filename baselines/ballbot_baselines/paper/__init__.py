@@ -1,0 +1,1 @@
+"""The paper's own problems, by direct collocation."""

@@ -1,0 +1,100 @@
+"""CasADi functions as machine code, kept in the user's cache folder; see `ballbot_gym.machine_code`.
+
+Where they cannot be compiled the interpreted functions are used, and one line of log says why. They are slower, with the same
+results to rounding.
+"""
+
+import logging
+
+import casadi
+import numpy as np
+
+from ballbot_gym import codegen, machine_code
+
+LANES = 8
+"""Stages that `in_lanes` computes at once: as many float64 as an AVX-512 register holds."""
+
+# Without -O2, GCC leaves the upper halves of vector registers dirty, which slows all SSE code that runs afterwards. It spends
+# most of its time on which registers to free. If it weighs fewer, it takes a third less, and the code is as fast.
+SIMD = (
+    *("-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd"),
+    *("--param", "lra-max-considered-reload-pseudos=50"),
+)
+"""Flags of the compiler for functions of `LANES` stages."""
+
+LONG = (*SIMD, "-O1")
+"""The same for tens of thousands of operations, on which the compiler would spend twice the time."""
+
+_log = logging.getLogger(__name__)
+
+
+def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.Function, ...]:
+    """The same functions, compiled into one shared library, or unchanged where they cannot be compiled.
+
+    Args:
+        name: what the library is called, for humans who look into the cache.
+        functions: expression graphs with distinct names.
+
+    Raises:
+        ValueError: $BALLBOT_CACHE is no absolute path.
+    """
+    generator = casadi.CodeGenerator("stage.c")
+    for function in functions:
+        generator.add(function)
+    return _loaded(name, generator.dump(), functions, ("-O2",)) or functions
+
+
+def in_lanes(
+    name: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...] = SIMD
+) -> tuple[casadi.Function, ...]:
+    """The same functions of `LANES` stages at once, which SIMD instructions compute: a column for each stage.
+
+    Args: as of `compiled`; arguments and results are dense columns. `flags` are the compiler's.
+
+    Raises:
+        ValueError: $BALLBOT_CACHE is no absolute path.
+    """
+    try:
+        found = _loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, flags)
+    except NotImplementedError:  # an operation that only CasADi knows as C
+        found = compiled(name, functions)
+        return tuple(function.map(LANES) for function in found)
+    return found or tuple(function.map(LANES) for function in functions)
+
+
+class InPlace:
+    """A function that reads and writes given arrays. A call through `casadi.DM` would take twice as long."""
+
+    def __init__(self, function: casadi.Function, inputs: list[np.ndarray], outputs: list[np.ndarray]):
+        self._buffer = function.buffer()[0]
+        self._inputs, self._outputs = ([array.data for array in arrays] for arrays in (inputs, outputs))
+
+    def __call__(self) -> bool:
+        """Whether it ran without an error."""
+        buffer = self._buffer
+        # HPIPM's interface uses up the pointers it is given (seen in CasADi 3.8.2), so they are given anew.
+        # The type stubs ask for a size, but memory views bring their own.
+        for i, view in enumerate(self._inputs):
+            buffer.set_arg(i, view)  # pyright: ignore[reportCallIssue]
+        for i, view in enumerate(self._outputs):
+            buffer.set_res(i, view)  # pyright: ignore[reportCallIssue]
+        buffer._eval()
+        return buffer.ret() == 0
+
+    @property
+    def solved(self) -> bool:
+        """Whether a solver reports success."""
+        return bool(self._buffer.stats()["success"])
+
+
+def _loaded(
+    name: str, source: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...]
+) -> tuple[casadi.Function, ...] | None:
+    """The functions of a library of C code; None where there is none."""
+    try:
+        library = machine_code.library(name, source, flags)
+        return tuple(casadi.external(function.name(), str(library)) for function in functions)
+    except RuntimeError as error:  # it cannot be compiled, or not be loaded
+        if str(error):
+            _log.warning("derivatives of %s stay interpreted: %s", name, str(error)[-300:])
+    return None

@@ -1,0 +1,132 @@
+"""Installs what is in dist/ as strangers do, outside of the repository, and uses it without a compiler and without a home.
+
+python release/check_dist.py DIST
+"""
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+ALONE = """
+import time, warnings
+warnings.simplefilter("error")
+import gymnasium, numpy as np
+from gymnasium.utils.env_checker import check_env
+import ballbot_gym
+from ballbot_gym import certified
+from ballbot_train import evaluate
+
+for task in ballbot_gym.TASKS.values():
+    env = gymnasium.make(task.id)
+    check_env(env.unwrapped)
+    envs = gymnasium.make_vec(task.id, num_envs=16384)
+    envs.reset(seed=0)
+    actions, begin = envs.action_space.sample(), time.perf_counter()
+    for _ in range(10):
+        observations, rewards, *_ = envs.step(actions)
+        assert np.isfinite(observations).all() and np.isfinite(rewards).all()
+    speed = 10 * 16384 / (time.perf_counter() - begin)
+    optima = certified.load(task(), ballbot_gym.default_params())
+    row = evaluate(lambda observation: np.zeros(2), env.unwrapped.task, episodes=2)
+    print(f"{task.id}: {env.unwrapped.physics}, {type(envs.unwrapped.batch).__name__} {speed:,.0f} steps/s, "
+          f"{len(optima.costs)} optima, {row.episodes} episodes")
+try:
+    evaluate("lqr", episodes=2)
+except ModuleNotFoundError as error:
+    assert 'pip install "ballbot-gym[baselines]"' in str(error), error
+else:
+    raise SystemExit("the experts ran without their extra")
+import sys
+learners = {"torch", "casadi", "scipy"} & set(sys.modules)
+assert not learners, learners
+"""
+"""What an installation without extras does."""
+
+
+class Stranger:
+    """A new virtual environment outside of the repository, with one distribution and some extras."""
+
+    def __init__(self, distribution: Path, extras: str, folder: Path):
+        self.folder = folder
+        self.python = folder / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+        subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
+        wanted = [f"ballbot-gym{extras} @ {distribution.resolve().as_uri()}", "-c", str(ROOT / "constraints.txt")]
+        if extras and sys.platform == "linux":
+            wanted.append(torch_for_processors())
+        install = [str(self.python), "-m", "pip", "install", "--quiet", "--no-compile"]
+        subprocess.run([*install, *wanted], check=True, cwd=folder)
+        # A folder below a file can be made by nobody, not even by root.
+        (folder / "file").touch()
+        kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP", "TMP", "LANG") if name in os.environ}
+        self.environment = {**kept, "PATH": str(self.python.parent), "HOME": str(folder / "file" / "home")}
+        self.environment["USERPROFILE"] = self.environment["HOME"]
+
+    def run(self, *command: str, code: str | None = None) -> str:
+        """Output of a program of the environment, which gets code as its input.
+
+        Raises:
+            SystemExit: it failed; its output is printed.
+        """
+        begin = time.perf_counter()
+        program = self.python.with_name(command[0])
+        done = subprocess.run(
+            [str(program), *command[1:]],
+            input=code, capture_output=True, text=True, cwd=self.folder, env=self.environment, check=False,
+        )  # fmt: skip
+        print(f"    {' '.join(command)}: {time.perf_counter() - begin:.0f} s", flush=True)
+        if done.returncode != 0:
+            sys.exit(f"{done.stdout[-3000:]}{done.stderr[-3000:]}\nfailed: {command}")
+        return done.stdout
+
+
+def torch_for_processors() -> str:
+    """The requirement of torch as it is here, whose wheels for processors alone are a tenth of the size."""
+    from importlib.metadata import version
+
+    return f"torch=={version('torch')}"
+
+
+def ten_lines() -> str:
+    """README's ten lines."""
+    return re.search(r"## Ten lines of code\n\n```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]  # type: ignore[index]
+
+
+def check(distribution: Path, extras: str) -> None:
+    """Installs a distribution and uses what its extras bring."""
+    print(f"{distribution.name}{extras}", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        stranger = Stranger(distribution, extras, Path(folder))
+        assert "commands:" in stranger.run("ballbot", "--help")
+        stranger.run("ballbot", "--version")
+        if not extras:
+            print(stranger.run("python", "-", code=ALONE), end="")
+        if extras == "[baselines]":
+            print(stranger.run("python", "-", code=ten_lines()), end="")
+        if extras == "[train]":
+            stranger.run("ballbot", "benchmark", "--episodes", "2")
+            assert (stranger.folder / "runs/benchmark/report.html").exists()
+        assert not (stranger.folder / "file" / "home").exists()
+
+
+def main() -> None:
+    """Checks all that lies in a folder."""
+    dist = Path(sys.argv[1])
+    (source,) = dist.glob("*.tar.gz")
+    (universal,) = dist.glob("*-py3-none-any.whl")
+    (compiled,) = set(dist.glob("*.whl")) - {universal}
+    for distribution in (source, universal, compiled):
+        check(distribution, "")
+    check(universal, "[baselines]")
+    check(compiled, "[baselines]")
+    check(compiled, "[train]")
+    print("dist: all checks passed")
+
+
+if __name__ == "__main__":
+    main()
