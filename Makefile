@@ -5,6 +5,7 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
+SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
 
 # Where bytecode may not be written, as in some containers, every process that a test or a command starts compiles what it
 # imports anew: one that trains takes 6 s to start in place of 2.5.
@@ -85,28 +86,28 @@ APPLY := $(addprefix tests/test_,env.py mujoco.py picture.py tasks.py dynamics.p
 
 pythons: $(addprefix python-,$(PYTHONS))
 
-.venv-pythons/uv/bin/uv:
+.venv-pythons/uv/$(SCRIPTS)/uv:
 	python3 -m venv .venv-pythons/uv
-	.venv-pythons/uv/bin/pip install uv
+	.venv-pythons/uv/$(SCRIPTS)/pip install uv
 
-python-%: .venv-pythons/uv/bin/uv
-	.venv-pythons/uv/bin/uv venv --clear --seed --python $* .venv-pythons/$*
-	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco]" pytest
-	.venv-pythons/$*/bin/python -m pytest tests/test_extras.py -k without_a_warning
-	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco,baselines]" filelock pytest rich tyro
-	.venv-pythons/$*/bin/python -m pytest -m "not slow" -k "not spec_of_an_env and not vector and not display" $(APPLY)
-	sed '1,/^```python/d; /^```/,$$d' README.md | .venv-pythons/$*/bin/python -
-	.venv-pythons/$*/bin/pip install --dry-run --quiet --only-binary=:all: -e ".[train]"
+python-%: .venv-pythons/uv/$(SCRIPTS)/uv
+	.venv-pythons/uv/$(SCRIPTS)/uv venv --clear --seed --python $* .venv-pythons/$*
+	.venv-pythons/$*/$(SCRIPTS)/pip install --no-compile -e ".[mujoco]" pytest
+	.venv-pythons/$*/$(SCRIPTS)/python -m pytest tests/test_extras.py -k without_a_warning
+	.venv-pythons/$*/$(SCRIPTS)/pip install --no-compile -e ".[mujoco,baselines]" filelock pytest rich tyro
+	.venv-pythons/$*/$(SCRIPTS)/python -m pytest -m "not slow" -k "not spec_of_an_env and not vector and not display" $(APPLY)
+	sed '1,/^```python/d; /^```/,$$d' README.md | .venv-pythons/$*/$(SCRIPTS)/python -
+	.venv-pythons/$*/$(SCRIPTS)/pip install --dry-run --quiet --only-binary=:all: -e ".[train]"
 
 # whether all that is needed has wheels on every system and Python; the registry is asked, and nothing is installed
-platforms: .venv-pythons/uv/bin/uv
-	python3 release/platforms.py .venv-pythons/uv/bin/uv
+platforms: .venv-pythons/uv/$(SCRIPTS)/uv
+	python3 release/platforms.py .venv-pythons/uv/$(SCRIPTS)/uv
 
 # the C code of all shipped robots and tasks
 code: build/code/codes.json
 
 build/code/codes.json: $(VENV)/installed $(shell find ballbot_gym baselines -name "*.py" -o -name "*.[ch]")
-	rm -rf build/code
+	rm -f build/code/*.c build/code/source/*
 	$(BIN)/python release/generated.py build/code
 
 # what is published, in dist/: the source, a wheel for every machine, and one with compiled code for machines like this one. Each

@@ -2,7 +2,7 @@
 
     python benchmarks/playground.py --minutes 10
 
-A robot is pushed every few seconds beside a ghost, and a page that somebody watches is drawn 30 times per second. Run it on
+A robot is pushed every few seconds next to a ghost, and a connected page is drawn 50 times per second. Run it on
 a quiet machine. Controllers are made before time counts. Steps after a planner's pause at the start of an episode count as
 late. The growth of memory is counted from the first minute on. Exit status 1 says that the real-time factor is below 0.99,
 that more than 0.1 % of the steps began later than 20 ms after their time, or that memory grew by more than 10 MiB.
@@ -68,7 +68,7 @@ def measure(
         minutes: how long.
         task: name of a task.
         controller: of the robot.
-        ghosts: controllers beside it.
+        ghosts: controllers of further robots.
         physics: "bullet", "mujoco" or "rk4".
         out: folder of the table.
     """

@@ -78,13 +78,15 @@ def zig(*arguments: str) -> None:
 def compile_for(target: str, codes: list[generated.Code], folder: Path) -> None:
     """Compiles all code to shared libraries for a target."""
     suffix = ".dll" if "windows" in target else ".so"
+    position = [] if "windows" in target else ["-fPIC"]
     for code in codes:
         path = folder / f"{code.stem}.c"
         path.write_text(code.source, encoding="utf-8")
         flags = [flag for flag in machine_code.without_parameters(code.flags) if not flag.startswith("-O")]
-        position = [] if "windows" in target else ["-fPIC", "-lm"]
-        out = str(folder / f"{code.stem}{suffix}")
-        zig("-target", target, "-O1", *flags, *_WARNINGS, *_EXPECTED, "-shared", *position, str(path), "-o", out)
+        built = ["-c", "-o", str(folder / f"{code.stem}.o")]
+        if code is codes[0]:  # one is linked: the others have no other undefined names
+            built = ["-shared", *([] if "windows" in target else ["-lm"]), "-o", str(folder / f"{code.stem}{suffix}")]
+        zig("-target", target, "-O1", *flags, *_WARNINGS, *_EXPECTED, *position, str(path), *built)
     print(f"{target}: {len(codes)} libraries without a warning", flush=True)
 
 

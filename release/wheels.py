@@ -36,18 +36,23 @@ def levels() -> tuple[str, ...]:
 
 
 def compile_all(codes: list[generated.Code], folder: Path) -> None:
-    """Compiles all code for every level of this machine's family."""
+    """Compiles all code for every level of this machine's family, unless a library of it is there already."""
     program = machine_code.compiler()
     if program is None:
         sys.exit("there is no C compiler: install one, or set CC")
     os.environ.setdefault("MACOSX_DEPLOYMENT_TARGET", _MACOS)
     for level in levels():
-        (folder / level).mkdir(parents=True)
+        (folder / level).mkdir(parents=True, exist_ok=True)
+        made = {path.stem.rpartition("-")[0]: path for path in (folder / level).iterdir()}
         for code in codes:
+            if code.stem in made:
+                continue
             with tempfile.TemporaryDirectory(dir=folder) as scratch:
                 built = Path(scratch) / f"code{machine_code.SUFFIX}"
                 machine_code.compile_library(program, code.source, built, (*code.flags, *LEVEL_FLAGS[level]))
                 machine_code.kept(built, folder / level, code.stem)
+        for stem in made.keys() - {code.stem for code in codes}:
+            made[stem].unlink()
         print(f"{level}: {len(codes)} libraries", flush=True)
 
 
@@ -79,13 +84,15 @@ def main() -> None:
     """Builds all three."""
     code, out = Path(sys.argv[1]), Path(sys.argv[2])
     shutil.rmtree(out, ignore_errors=True)
+    libraries = code.resolve() / "compiled"
+    compile_all(generated.read(code), libraries)
     with tempfile.TemporaryDirectory() as scratch:
-        compiled = Path(scratch) / "compiled"
-        shutil.copytree(code / "source", compiled / "source")
-        build("sdist", out, compiled)
-        build("wheel", out, compiled)
-        compile_all(generated.read(code), compiled)
-        build("wheel", out, compiled, platform_tag(compiled))
+        content = Path(scratch) / "compiled"
+        shutil.copytree(code / "source", content / "source")
+        build("sdist", out, content)
+        build("wheel", out, content)
+        shutil.copytree(libraries, content, dirs_exist_ok=True)
+        build("wheel", out, content, platform_tag(content))
     for path in sorted(out.iterdir()):
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
 

@@ -14,6 +14,7 @@ import pytest
 
 from ballbot_baselines.feedback import trajopt
 from ballbot_baselines.feedback.trajopt import EXECUTED
+from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main
@@ -65,6 +66,13 @@ def test_seeds_and_actions_replay_the_episodes(dataset):
             assert np.array_equal(observation, after)
             assert again == reward
     env.close()
+
+
+def test_scores_are_normalized_between_random_actions_and_the_optima(dataset):
+    metadata = minari.MinariDataset(dataset / "data").storage.metadata
+    optimal = 800 - certified.load("stabilize", "paper").costs.mean()  # return + cost = 800
+    assert metadata["ref_max_score"] == pytest.approx(optimal, abs=1e-3)
+    assert 0 < metadata["ref_min_score"] < 50
 
 
 def test_every_episode_says_who_showed_it_and_what_it_cost(dataset):

@@ -255,3 +255,37 @@ def test_tables_of_commands_say_their_engine(command, file, tmp_path, typed):
     header, _, first = (tmp_path / "out" / file).read_text().splitlines()[:3]
     told = dict(zip(header.split(" | "), first.split(" | "), strict=True))
     assert told["physics"] == "rk4"
+
+
+class Predicts:
+    """Objects with the usual signatures of `predict`, all of which stand still."""
+
+    class Alone:
+        def predict(self, observation):
+            return np.zeros(2)
+
+    class WithState:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            assert deterministic
+            return np.zeros(2), None
+
+    class Deterministic:
+        def predict(self, obs, deterministic=False):
+            assert deterministic
+            return np.zeros(2), {"more": 1}, 3
+
+    class Anything:
+        def predict(self, observation, **options):
+            assert options["deterministic"]
+            return (np.zeros(2),)
+
+
+def test_objects_with_any_usual_predict_and_torch_modules_are_policies():
+    still = torch.nn.Linear(8, 2, dtype=torch.float64)
+    torch.nn.init.zeros_(still.weight)
+    torch.nn.init.zeros_(still.bias)
+    policies = [Predicts.Alone(), Predicts.WithState(), Predicts.Deterministic(), Predicts.Anything(), still]
+    costs = {evaluate.evaluate(policy, "stabilize", episodes=2, physics="rk4").cost_mean for policy in policies}
+    assert costs == {
+        evaluate.evaluate(lambda observation: np.zeros(2), "stabilize", episodes=2, physics="rk4").cost_mean
+    }

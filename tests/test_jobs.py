@@ -222,7 +222,7 @@ def test_of_nested_settings_only_those_that_differ_are_named(tmp_path):
 
 
 WITHOUT_GUARD = """
-from ballbot_train import jobs
+from ballbot_train.work import jobs
 from pathlib import Path
 from test_jobs import ignore, job, squares
 

@@ -7,8 +7,8 @@ from ballbot_baselines import LqrController, find_optimum
 from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_baselines.solvers.linearize import discretize, goal_weight, quadratic_cost
 from ballbot_baselines.solvers.riccati import discrete_lqr, tracking_gains
-from ballbot_gym import dynamics
-from ballbot_gym.rollout import rollout
+from ballbot_gym import Reference, dynamics
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 
 ORIGIN, NO_FORCE, NO_CONSTANTS = np.zeros(8), np.zeros(2), np.zeros(0)
@@ -143,3 +143,19 @@ def test_equilibrium_gain_gives_lqrs_force_and_cost_from_the_observation(params)
     observation = np.asarray(task.observe(x, NO_CONSTANTS))[:8]
     np.testing.assert_allclose(params.force_limit * action_gain @ observation, -k @ x, rtol=1e-12)
     assert observation @ weight @ observation == pytest.approx(x @ p @ x, rel=1e-12)
+
+
+class LaneChange(Stabilize):
+    """Ends in another lane, at speed: a reference that moves is a motion, and no point."""
+
+    def reference(self, x, c, params):
+        lane = np.zeros((1, 8))
+        lane[0, 1], lane[0, 4] = 1.0, 3.0
+        return Reference(lane, np.zeros((1, 2)))
+
+
+def test_lqr_about_a_single_point_that_moves_is_refused_with_what_a_reference_is(params):
+    with pytest.raises(
+        PlanError, match=r"one point must rest\. Let LaneChange\.reference return a motion, with one point per"
+    ):
+        LqrController(LaneChange(), params).reset(0.0, np.zeros(8), np.zeros(0))

@@ -69,7 +69,7 @@ def test_controls_change_the_playground(opened, visitor):
     wait_for(lambda: playground.episode == 7)
     assert (playground.plant["mass"], opened.page.speed, playground.main.name) == (40.0, 2.0, "shac")
     wait_for(lambda: visitor.value(MASSES) == 40.0)
-    visitor.ask("Change nothing")
+    visitor.ask("Set all to 0")
     wait_for(lambda: playground.plant["mass"] == 0.0 == visitor.value(MASSES))
     visitor.ask("Episode", "random")
     wait_for(lambda: playground.episode == "random")
@@ -221,7 +221,7 @@ def test_in_the_browser_controls_ask_for_changes_and_show_them(opened, browser):
     """
     browser.execute_script(change, MASSES, 20)
     wait_for(lambda: opened.playground.plant["mass"] == 20)
-    browser.execute_script(change, "Change nothing", True)
+    browser.execute_script(change, "Set all to 0", True)
     wait_for(lambda: opened.playground.plant["mass"] == 0)
     browser.execute_script(change, "shac", True)
     wait_for(lambda: opened.playground.ghosts == ("shac",))

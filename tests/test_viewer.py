@@ -1,5 +1,6 @@
 """The server whose page shows drawings: what it sends, who may connect, and that no client harms it."""
 
+import copy
 import http.client
 import json
 import socket
@@ -205,8 +206,14 @@ def test_an_environment_shows_itself_in_a_page(capsys):
         env.step([0.0, 0.0])
     assert time.perf_counter() - began > 4 * env.task.control_dt  # real time
     assert b"<html" in urllib.request.urlopen(address, timeout=5).read(1000)
+    other = copy.deepcopy(env)  # has a page of its own
     env.close()
     env.close()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(address, timeout=5)
+    other.step([0.0, 0.0])
+    assert capsys.readouterr().err.startswith("the robot is shown at http://localhost:")
+    other.close()
 
 
 def test_every_environment_has_a_page_of_its_own_which_a_browser_draws(capsys, tmp_path):

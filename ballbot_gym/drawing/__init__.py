@@ -50,8 +50,8 @@ class Robot:
 
 @dataclass(frozen=True)
 class GroundPath:
-    """A line on the floor through points (n, 2), m: where a robot was, or dashed, a ring. Its colour is as of a robot or
-    as of a marker.
+    """A line on the floor through points (n, 2), m: the path of a robot, or a dashed ring. Its colour has the form of a
+    robot's colour or of a marker's.
     """
 
     points: np.ndarray
@@ -108,9 +108,8 @@ def pose(params: BallbotParams, x: np.ndarray) -> Pose:
 def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
     """Colour, and start and end (3,), m, of the arrows of a robot's force and push, where there is one to draw.
 
-    The forces of three wheels have no one direction, and get none.
-
-    The force's starts at the ball's centre, and the push's at the body's centre of mass, as of `pose`.
+    The force's arrow starts at the ball's centre, and the push's at the body's centre of mass; see `pose`. The forces of
+    three wheels have no common direction, so they get no arrow.
     """
     drawn = ((FORCE, robot.u, FORCE_SCALE, LEAST_FORCE, place.ball), (PUSH, robot.push, PUSH_SCALE, 0.0, place.body))
     return [

@@ -1,7 +1,7 @@
 """A server on this machine whose page in the browser shows drawings live. It needs no display, because the browser draws.
 
 `ballbot play` adds its controls to the page. An environment with render_mode="human" shows itself here. The page is served
-over HTTP, and a WebSocket carries moments to it, and what its readers ask for back, as JSON.
+over HTTP. A WebSocket carries moments to it, and the requests of its readers back, as JSON.
 
 Any page that is open in a browser can connect to a server on the same machine, and can give this machine a name that it owns.
 So `Host` and `Origin` of every request are checked, and no other page may frame this one.
@@ -29,7 +29,7 @@ _NEXT_PORTS = 100  # that are tried where one is taken
 _LOCAL = r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"  # names that no website can have; tunnels have other ports
 _MOST_CLIENTS = 32
 _LONGEST = 4096  # bytes of a message from a page; a longer one ends its connection, and the page connects again
-_PER_SECOND, _AT_ONCE = 25.0, 50  # messages of a client that are read; others are left out
+_PER_SECOND, _AT_ONCE = 25.0, 50  # messages of a client that are read; others are ignored
 
 _LOGGER = logging.getLogger(__name__)
 _LOGGER.addHandler(logging.NullHandler())
@@ -70,7 +70,7 @@ class Viewer:
         data = f"const DATA = {json.dumps(look(default_params()))};"
         self._page = (page_html(data, live=True) if page is None else page).encode()
         self.on_ask: Callable[[str, Any], object] = lambda name, value: None
-        """Gets the name and the value of what a page asks for. It is called in the server's thread."""
+        """Is called in the server's thread with the name and the value of each request of a page."""
         self._socket = _listening(port)
         self.port: int = self._socket.getsockname()[1]
         self._next = 0.0
@@ -96,15 +96,16 @@ class Viewer:
         self.send("moment", moment(drawing))
 
     def show(self, drawing: Drawing, seconds: float) -> None:
-        """Shows a moment when so much time has passed since the last one, s."""
+        """Shows a moment, `seconds` after the last one."""
         now = time.perf_counter()
         self._next = max(self._next + seconds, now)
         time.sleep(self._next - now)
         self.draw(drawing)
 
     def send(self, kind: str, content: Any) -> None:
-        """Sends something of a kind that stream.js knows to every page, those that come later too. It replaces what was sent
-        of that kind before; the same is not sent again.
+        """Sends content of a kind that stream.js shows to all pages, and to pages that connect later.
+
+        It replaces the content of that kind that was sent before. The same content is not sent twice.
         """
         text = json.dumps({kind: content}, separators=(",", ":"))
         if self._last.get(kind) != text and not self._loop.is_closed():
@@ -172,7 +173,7 @@ class Viewer:
             sender.cancel()
 
     async def _send_news(self, connection: Any, news: asyncio.Event) -> None:
-        """Sends what is new, one message after the other: what a slow page misses is left out."""
+        """Sends the newest message of each kind, one after the other. A slow page misses the messages between."""
         from websockets.exceptions import ConnectionClosed
 
         sent: dict[str, str] = {}
@@ -186,7 +187,7 @@ class Viewer:
                 news.clear()
 
     def _take(self, message: str | bytes) -> None:
-        """Passes on what a page asks for. What is no pair of a name and a value is left out."""
+        """Passes on the request of a page. A message that is not a pair of a name and a value is ignored."""
         with contextlib.suppress(ValueError, TypeError, RecursionError):
             name, value = json.loads(message)
             if isinstance(name, str):

@@ -26,7 +26,7 @@ except ModuleNotFoundError as error:
 
     sys.exit(str(missing("ballbot", error.name, "train")))
 
-from ballbot_train.commands import COMMANDS, MOVED, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -196,14 +196,17 @@ def _expected() -> tuple[type[RuntimeError], ...]:
 
 def _print_help() -> None:
     console = PlainConsole(highlight=False)
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name in COMMANDS:
-        table.add_row(name, help_of(name))
     console.width = max(console.width, _LEAST_WIDTH)
-    console.print(f"usage: ballbot COMMAND [OPTIONS]\n\n{_DESCRIPTION}\n\ncommands:")
-    console.print(table)
+    console.print(f"usage: ballbot COMMAND [OPTIONS]\n\n{_DESCRIPTION}")
+    widest = max(map(len, COMMANDS))
+    for group, names in GROUPS.items():
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
+        table.add_column(style="bold", no_wrap=True, min_width=widest)
+        table.add_column(overflow="fold")
+        for name in names:
+            table.add_row(name, help_of(name))
+        console.print(f"\n{group}:")
+        console.print(table)
     console.print("\n`ballbot COMMAND --help` lists the options of a command; `ballbot --version` says the version.")
 
 

@@ -114,7 +114,7 @@ class Player {
     this.wait(performance.now());
   }
 
-  /** Calls `tick` in every frame, with the seconds to go on by, and those that have passed, at most 0.1. */
+  /** Calls `tick` in every frame, with the seconds by which time advances, and the seconds that have passed, at most 0.1. */
   wait(last) {
     requestAnimationFrame((now) => {
       const passed = Math.min(Math.max(now - last, 0) / 1000, 0.1);
@@ -299,7 +299,7 @@ class Scene {
     }
   }
 
-  /** An arrow on the floor, from beside a robot towards a point that is not close to it. */
+  /** An arrow on the floor, from a robot towards a point that is not close to it. */
   drawGoal([x, y], goal, color) {
     const way = [goal[0] - x, goal[1] - y, 0];
     const distance = Math.hypot(...way);

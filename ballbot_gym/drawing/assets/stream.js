@@ -45,7 +45,7 @@ class Stream {
     };
   }
 
-  /** Leaves the stream. Python stands still while nobody watches. */
+  /** Leaves the stream. The simulation pauses while no page is connected. */
   close() {
     const socket = this.socket;
     this.socket = null;

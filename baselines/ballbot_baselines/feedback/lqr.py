@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines.solvers.riccati import discrete_lqr, reference_gains
+from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium, reference_gains
 from ballbot_gym import omni
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
@@ -45,6 +45,8 @@ class LqrController:
     with forces that look ahead, because it may be no motion of the robot.
 
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
+
+    `reset` raises a PlanError where the reference is a single point that is no equilibrium.
     """
 
     def __init__(self, task: Task, params: BallbotParams):
@@ -55,6 +57,11 @@ class LqrController:
         self._start = t
         found = task.reference(x[:8], c, params)
         states, forces = omni.with_wheels(params, found.x, found.u)
+        if len(states) == 1 and not is_equilibrium(params, states[0], forces[0]):
+            raise PlanError(
+                f"LQR of {task.id} would hold the robot at one point that it leaves by itself: a reference of one point must "
+                f"rest. Let {type(task).__name__}.reference return a motion, with one point per control step"
+            )
         reference = replace(found, x=states, u=forces)
         self.reference, self.gains = reference_gains(task, params, reference, c, t)
 

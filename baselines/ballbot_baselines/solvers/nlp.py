@@ -147,7 +147,8 @@ class Stages:
         Args:
             name: what the compiled functions are called, for humans who look into the cache.
             variables: s, w and p.
-            moves: the next state and 0; or rates of the state, and the number of RK4 steps that integrate them over a time of 1.
+            moves: the next state and 0; or rates of the state, and the number of RK4 steps that integrate them over a
+                time of 1.
             running: cost, equalities and inequalities.
             final: the same of the end.
             params: length of p without the number of the stage.

@@ -1,19 +1,21 @@
 """The commands of `ballbot`, one file each. A command is imported when it is called.
 
-To add a command, write `NAME.py` with a function of the same name, and its name to `COMMANDS`.
+To add a command, write `NAME.py` with a function of the same name, and its name to `GROUPS`.
 """
 
 import ast
 from importlib.util import find_spec
 from pathlib import Path
 
-COMMANDS = {
-    name: f"{__name__}.{name}:{name}"
-    for name in (
-        *("benchmark", "evaluate", "compare", "submit", "verify", "robustness", "transfer", "basins", "paper"),
-        *("optimize", "replay", "play", "page", "certify", "demos", "export", "train", "new"),
-    )
+GROUPS = {
+    "measure": ("benchmark", "evaluate", "compare", "robustness", "transfer", "basins", "submit", "verify"),
+    "look": ("play", "page", "replay", "optimize", "paper"),
+    "train": ("train", "demos"),
+    "make": ("new", "certify", "export"),
 }
+"""The commands by what they are for, in the order of `ballbot --help`."""
+
+COMMANDS = {name: f"{__name__}.{name}:{name}" for names in GROUPS.values() for name in names}
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 
 MOVED = {"tune": "`ballbot tune` is an example now: python examples/tune.py --task TASK (in the source repository)"}

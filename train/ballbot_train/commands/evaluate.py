@@ -31,6 +31,7 @@ from ballbot_train.work.console import (
 from ballbot_train.work.executors import Workers
 from ballbot_train.work.provenance import provenance
 
+_OPTIMA = 100  # fresh episodes whose regret is shown unless another number is given
 _WORST = 10
 _SHOWN_BINS = 6
 _FULL_BIN = 20  # episodes from which a bin is called weak
@@ -44,7 +45,7 @@ def evaluate(
     fresh: int | None = None,
     physics: Physics | None = None,
     seed: int = 0,
-    optima: int = 0,
+    optima: int | None = None,
     out: Path | None = None,
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
@@ -61,8 +62,9 @@ def evaluate(
         fresh: instead of certified episodes, how many fresh ones, in the batched closed-form model.
         physics: of certified episodes: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of the fresh episodes, or of the bootstrap intervals and of whatever a certified episode draws.
-        optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
-            user's cache folder, for later calls and other policies.
+        optima: of how many fresh episodes, from the first, the optimum is found too, for their regret; default the first
+            100, and none where --randomization varies what optima depend on. Optima stay in the user's cache folder, for
+            later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
         workers: who runs certified episodes, and finds optima.
         robot: whose episodes.
@@ -72,12 +74,14 @@ def evaluate(
     varied = checked_randomization(randomization)
     task, policy = task_name(policy, task, robot), behind(policy, filter)
     chosen = controllers_of([task], [policy], robot)
-    check_least(0, optima=optima)
+    check_least(0, optima=optima or 0)
     named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     if fresh is not None:
         if physics not in (None, "rk4"):
             raise ValueError("fresh episodes run in the batched closed-form model; leave out --physics")
+        if optima is None:
+            optima = 0 if varied.moves_optima else min(_OPTIMA, fresh)
         _evaluate_fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
         return
     if optima:

@@ -30,14 +30,14 @@ def play(
         task: name of a task; default the one that the controller's file names or whose observations fit, or else stabilize.
         controller: of the robot: an expert, a policy that comes with the package, a policy file, or a model saved
             by Stable-Baselines3 (.zip); default, the best shipped policy.
-        ghosts: controllers that get the same start and the same pushes beside it.
+        ghosts: controllers of further robots, with the same start and the same pushes.
         episode: index of the certified episode it starts with, a random start, or at rest until a push that fells LQR;
             default, at rest where all episodes of the task differ in their start alone, and else 0.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         robot: name of a robot.
         seed: of random starts, noise and pushes.
         port: where the page is, for this machine only; the next free one, if it is taken.
-        randomization: name of a track, as "unknown": every episode has a robot of it, which the controllers are not told.
+        randomization: name of a track, as "unknown": every episode has a robot of it, which is hidden from the controllers.
     """
     task = task_name(controller or "", task, robot)
     need_library()

@@ -2,7 +2,9 @@
 anything else that acts, as a controller.
 """
 
+import inspect
 import itertools
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +18,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train.policy import files
+from ballbot_train.policy import files as policy_files
 from ballbot_train.policy.files import PolicyError, is_run, read_description, shipped_policies, weights_digest
 from ballbot_train.work.console import check_names, check_some
 
@@ -135,7 +137,7 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
 def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
     """Digest of the network of a policy by name or file, as its description says; see `policy.files.network_digest`."""
     name = split(name)[0]
-    return files.network_digest(shipped_policies(task, robot, None).get(name, name))
+    return policy_files.network_digest(shipped_policies(task, robot, None).get(name, name))
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
@@ -245,8 +247,9 @@ def as_controller(policy: Any, task: Task, params: BallbotParams, filter: str | 
 
     Args:
         policy: a Controller; a Stable-Baselines3 model that was trained in the env's own spaces, whose VecNormalize is
-            applied where it was trained with one; a function from observation (no,) float32 to action (2,) in [−1, 1]; or a
-            name or file for `make_controller`.
+            applied where it was trained with one; another object with `predict(observation)`, which returns an action or a
+            tuple that begins with one; a torch module from observations (B, no) to actions (B, 2); a function from
+            observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
         task: what it is to do.
         params: the robot that it believes to control.
         filter: one of `filters` that stands in front of it.
@@ -266,22 +269,45 @@ def _acting(policy: Any, task: Task, params: BallbotParams) -> Controller:
     if callable(getattr(policy, "predict", None)):
         predictor = Predictor(policy, task, params)
         return ActionController(task, params, predictor, predictor.history)
+    torch: Any = sys.modules.get("torch")
+    if torch is not None and isinstance(policy, torch.nn.Module):
+        return ActionController(task, params, _module_actions(policy))
     if callable(policy):
         function = cast(Callable[[np.ndarray], np.ndarray], policy)
         return ActionController(task, params, lambda observation, begins: function(observation))
     raise TypeError(
-        f"{policy!r} is no policy: give a Controller, a model with predict, a function of the observation, a name or a file"
+        f"{policy!r} is no policy: give a Controller, a model with predict, a torch module or a function of the observation, "
+        "a name or a file"
     )
 
 
+def _module_actions(module: Any) -> Callable[[np.ndarray, bool], np.ndarray]:
+    """The actions of a torch module, which takes (B, no) observations on the device and in the precision of its numbers."""
+    import torch
+
+    first = next(module.parameters(), torch.zeros(0))
+
+    def actions(observation: np.ndarray, begins: bool) -> np.ndarray:
+        seen = torch.as_tensor(np.atleast_2d(observation), dtype=first.dtype, device=first.device)
+        with torch.no_grad():
+            made = module(seen)
+        made = (made[0] if isinstance(made, tuple) else made).cpu().numpy()
+        return made if observation.ndim > 1 else made[0]
+
+    return actions
+
+
 class Predictor:
-    """An SB3 model's deterministic actions (..., 2) for observations (..., no) of an episode, or of one episode per env.
+    """The deterministic actions (..., 2) of an SB3 model, or of another object with `predict`.
+
+    Observations (..., no) are of an episode, or of one episode per env.
 
     It keeps the recurrent state, and normalizes observations as in training.
     """
 
     def __init__(self, model: Any, task: Task, params: BallbotParams):
         self._model, self._state, self.history = model, None, 0
+        self._takes = _keywords(model.predict)
         if hasattr(model, "observation_space"):
             from ballbot_train.policy.saved_models import check_spaces, history_of  # it imports torch
 
@@ -297,13 +323,24 @@ class Predictor:
         self._seen = (lambda observation: observation) if normalization is None else normalization.normalize_obs
 
     def __call__(self, observation: np.ndarray, begins: bool) -> np.ndarray:
-        action, self._state = self._model.predict(
-            self._seen(observation),
-            state=None if begins else self._state,
-            episode_start=np.full(len(np.atleast_2d(observation)), begins),
-            deterministic=True,
-        )
+        offered = {
+            "state": None if begins else self._state,
+            "episode_start": np.full(len(np.atleast_2d(observation)), begins),
+            "deterministic": True,
+        }
+        taken = {name: value for name, value in offered.items() if self._takes is None or name in self._takes}
+        made = self._model.predict(self._seen(observation), **taken)
+        action, self._state = (made[0], made[1] if len(made) > 1 else None) if isinstance(made, tuple) else (made, None)
         return action
+
+
+def _keywords(function: Any) -> set[str] | None:
+    """The keywords that a function takes; None where it takes any, or does not say."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    return None if any(each.kind is each.VAR_KEYWORD for each in parameters) else {each.name for each in parameters}
 
 
 def controllers_of(
@@ -347,17 +384,13 @@ def controllers_by_robot(
 
 def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
     """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
-    return _of_policies(policy_digest, controllers, robot)
+    return digests_of_policies(controllers, robot, policy_digest)
 
 
-def network_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
-    """As `policy_digests`, of the networks."""
-    return _of_policies(network_digest, controllers, robot)
-
-
-def _of_policies(
-    digest: Callable[[str, Task, str], str], controllers: Mapping[str, Sequence[str]], robot: str
+def digests_of_policies(
+    controllers: Mapping[str, Sequence[str]], robot: str, digest: Callable[[str, Task, str], str]
 ) -> dict[str, str]:
+    """A digest of every learned policy among controllers by task, under "TASK/NAME"."""
     return {
         f"{task}/{name}": digest(name, make_task(task, robot), robot)
         for task, group in controllers.items()

@@ -69,9 +69,9 @@ def open_run(
         {
             name if made_for == robot else f"{made_for}/{name}": found
             for made_for, by_task in chosen.items()
-            for name, found in digests(by_task, made_for).items()
+            for name, found in registry.digests_of_policies(by_task, made_for, digest).items()
         }
-        for digests in (registry.policy_digests, registry.network_digests)
+        for digest in (registry.policy_digest, registry.network_digest)
     )
     problems = {
         task if name == robot else f"{name}/{task}": named_problem(task, name)

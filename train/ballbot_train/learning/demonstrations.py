@@ -39,7 +39,7 @@ from minari.dataset.minari_dataset import parse_dataset_id
 
 from ballbot_baselines import CONTROLLERS, Backoff
 from ballbot_baselines.feedback.trajopt import EXECUTED
-from ballbot_gym import seeding
+from ballbot_gym import certified, files, seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.identity import digest, named_problem
@@ -336,6 +336,7 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
             description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
             requirements=[f"ballbot-gym>={importlib.metadata.version('ballbot-gym')}"],
             data_format="hdf5",
+            **_scores(task, config.robot),
         )
     dataset.storage.update_episode_metadata(about)
     dataset.storage.update_metadata(
@@ -347,6 +348,12 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
         }
     )
     (root / out.name).rename(out)
+
+
+def _scores(task: Task, robot: str) -> dict[str, float]:
+    """Mean returns of random actions and of the optima, by which Minari normalizes scores; of the shipped tasks alone."""
+    path = Path(certified.__file__).with_name("scores.json")
+    return files.read_json(path).get(task.id, {}) if robot == PAPER else {}
 
 
 def _buffers(arrays: Mapping[str, np.ndarray]) -> Iterator[EpisodeBuffer]:

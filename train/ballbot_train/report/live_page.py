@@ -1,7 +1,8 @@
 """The page of the live playground: its controls, and the loop that keeps the simulation in real time.
 
-Browsers ask for things in the server's thread. The loop of the simulation does them between two steps, so the playground
-needs no locks. Of what is asked for several times meanwhile, the last counts: no number of requests can make the loop late.
+Requests of pages arrive in the server's thread. The loop of the simulation does them between two steps, so the playground
+needs no locks. If there are several requests for one control, only the last one is done, so that no number of requests delays
+the loop.
 """
 
 import math
@@ -21,18 +22,18 @@ from ballbot_train.report import labels
 from ballbot_train.report.simulation import Playground, Runner, Start, failure_word, severities
 
 PATIENCE = 0.1
-"""s of lag that is caught up; more, as of a planner, is given up."""
+"""s of lag that is caught up. A longer lag, for instance of a planner, is not."""
 _DRAW_HZ, _TEXT_HZ = 50.0, 10.0
-_IDLE = 0.1  # s, between two looks while nobody is there
+_IDLE = 0.1  # s, between two checks while no page is connected
 _SPEEDS = (0.1, 2.0, 0.01)  # simulated seconds per second: least, greatest, step
 _NOTICE_LENGTH = 300
 _HELP = "Drag a robot and let go: every robot gets the same push. Drag the floor to look around."
-_GHOSTS, _HIDDEN = "Ghosts", "Changes that the controllers do not know"
+_GHOSTS, _HIDDEN = "Ghosts", "Changes hidden from the controllers"
 
 
 @dataclass(frozen=True)
 class Control:
-    """Something that a page may change. Pages ask for it by its name."""
+    """Something that a page can change, by its name."""
 
     name: str
     apply: Callable[[Any], object]
@@ -76,7 +77,7 @@ class Control:
 
 
 class PlayPage:
-    """Controls and scene of a playground in a viewer, and the loop that runs them. Who opens the page may use them."""
+    """Controls and scene of a playground in a viewer, and the loop that runs them. Every open page has them."""
 
     def __init__(self, playground: Playground, viewer: Viewer):
         """Builds the page; `run` brings it to life.
@@ -88,7 +89,7 @@ class PlayPage:
         self.playground, self.viewer = playground, viewer
         self.paused = self.stopped = False
         self.speed = 1.0
-        self._asked: dict[str, Any] = {}  # by the name of a control, the last value that a page asked for
+        self._asked: dict[str, Any] = {}  # by the name of a control, the last value that a page has requested
         self._lock = threading.Lock()  # of that
         self._controls: dict[str, Control] = {}
         self._next_text = 0.0
@@ -99,7 +100,7 @@ class PlayPage:
     # --- the loop ---
 
     def run(self, seconds: float = math.inf) -> None:
-        """Simulates and draws in real time until `stopped` is set, or for some seconds. Stands still while nobody watches."""
+        """Simulates and draws in real time until `stopped` is set, or for some seconds. Pauses while no page is connected."""
         now = due = next_draw = time.perf_counter()
         end = now + seconds
         while not self.stopped and now < end:
@@ -127,20 +128,22 @@ class PlayPage:
         return max(due, now - PATIENCE) + self.playground.world.task.control_dt / self.speed
 
     def _ask(self, name: str, value: Any) -> None:
-        """Takes a request, in the server's thread. What names no control is left out."""
+        """Takes a request, in the server's thread. A request that names no control is ignored."""
         with self._lock:
             if name in self._controls:
                 self._asked.pop(name, None)  # so that it comes after the others
                 self._asked[name] = value
 
     def _do_requests(self) -> None:
-        """Does what was asked for until now. What cannot be done is said, and the simulation goes on."""
+        """Does what pages have requested. The page shows why a request fails, and the simulation continues."""
         with self._lock:
             asked, self._asked = self._asked, {}
         for name, value in asked.items():
+            control = self._controls.get(name)
+            if control is None:  # the request before it has chosen a task or robot without this control
+                continue
             self.playground.notice = ""
             try:
-                control = self._controls[name]
                 control.apply(control.checked(value))
             except Exception as error:
                 self.playground.notice = str(error) or repr(error)
@@ -176,7 +179,7 @@ class PlayPage:
                 )
                 for name, stress in STRESSES.items()
             ),
-            Control("Change nothing", lambda _: self._reset_plant(), group=_HIDDEN),
+            Control("Set all to 0", lambda _: self._reset_plant(), group=_HIDDEN),
         ]
 
     def _refresh(self) -> None:
@@ -187,7 +190,7 @@ class PlayPage:
             Control("speed", partial(setattr, self, "speed"), lambda: self.speed, limits=_SPEEDS),
             Control("Restart", lambda _: self.playground.restart()),
             _Push("push", lambda impulse: self.playground.push(*impulse)),
-        ]  # which stream.js has places of its own for
+        ]  # stream.js shows these in other places than the panel
         with self._lock:
             self._controls = {control.name: control for control in [*shown, *hidden]}
         self.viewer.send("panel", [control.shown for control in shown])
@@ -207,7 +210,7 @@ class PlayPage:
     # --- words ---
 
     def _announce(self, text: str) -> None:
-        """Says what is about to be done, before it is done."""
+        """Shows what happens next, before it happens."""
         self.viewer.send("status", self._status() | {"text": text})
         self._next_text = 0.0
 

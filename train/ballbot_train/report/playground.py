@@ -1,4 +1,4 @@
-"""The playground without Python: one HTML page in which a learned policy and LQR balance beside the optimum, and the reader
+"""The playground without Python: one HTML page in which a learned policy and LQR balance next to the optimum, and the reader
 pushes them, or drives an episode.
 
 Everything is in the page: the closed-form model, the tasks' costs, limits and observations, LQR's gains and the policies'
@@ -46,7 +46,7 @@ class Scenario:
     """What to look at, in a sentence or two."""
     task: str
     episodes: tuple[int | None, ...] = (None,)
-    """The certified episodes that can be chosen; None is standing at rest at the origin. The text tells of the first one."""
+    """The certified episodes that can be chosen; None is standing at rest at the origin. The text describes the first one."""
     push: tuple[float, float, float] | None = None
     """A push that comes by itself: time, s, impulse, N·s, and bearing, rad."""
 
@@ -92,7 +92,7 @@ def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
 
     Args:
         path: of the HTML file.
-        policies: files of policies, each shown in place of the shipped one of its task.
+        policies: files of policies, each shown instead of the shipped one of its task.
 
     Raises:
         PolicyError: a file is no policy, or that of one that sees more than the present observation.
@@ -106,7 +106,7 @@ def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
 
 
 def playground_page(policies: Sequence[str] = (), live: bool = False) -> str:
-    """The page as HTML; `live` as for `page_html`. Errors: as of `write_playground`."""
+    """The page as HTML; `live` as for `page_html`. Errors: see `write_playground`."""
     return page.page_html(engine_script(policies), asset("playground.js"), live)
 
 
@@ -143,7 +143,7 @@ def _policies(given: Sequence[str]) -> dict[str, Path]:
 
 
 def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
-    """What a policy computes with, beside what is printed."""
+    """The data of a policy, besides the printed functions."""
     if network.spec.seen != network.spec.observations:
         raise PolicyError(f"{path} sees more than the present observation, and the page computes that alone")
     name = str(read_description(path).get("training", {}).get("learner", path.stem))

@@ -110,7 +110,7 @@ class Runner:
         self.cost, self.peak, self.violated, self.arrived = 0.0, float(dynamics.tilt(self.x)), "", False
 
     def move_to(self, env: BallbotEnv) -> None:
-        """Goes on in another environment, in the middle of an episode."""
+        """Continues the episode in another environment."""
         before = self.env.get_state()
         self.env.close()
         self.env = env
@@ -193,16 +193,16 @@ class Playground:
                 of a model that Stable-Baselines3 saved; default, `World.best`.
             ghosts: controllers of the ghosts.
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
-            episode: as of `begin`.
+            episode: see `begin`.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `robots.ROBOTS`.
-            randomization: name of a track: every episode has a robot of it, which the controllers are not told.
+            randomization: name of a track: every episode has a robot of it, which is hidden from the controllers.
 
         Raises:
             ValueError: an unknown task, robot, controller, episode or track.
         """
         self.announce: Callable[[str], object] = lambda text: None
-        """Is told in words what is about to be done that may take long."""
+        """Is called with a sentence before something that may take long."""
         self.scores: list[Score] = []
         """Of the main robot's episodes."""
         self.plant = dict.fromkeys(STRESSES, 0.0)
@@ -287,7 +287,7 @@ class Playground:
             if not runner.stands_still:
                 try:
                     command = runner.command(self.seconds)
-                except Exception as error:  # a controller of any kind, such as a policy: the others go on
+                except Exception as error:  # a controller of any kind, such as a policy: the others continue
                     self.notice = f"{labels.label(runner.name)}: {error}"
                     command = np.zeros(self.world.params.action_size)
                 runner.step(command)
@@ -321,7 +321,7 @@ class Playground:
         self.begin("random" if world.certified is None else 0)
 
     def set_controller(self, name: str) -> None:
-        """Another controller for the main robot, which goes on where it is."""
+        """Another controller for the main robot, which continues where it is."""
         controller = self._made(name, self.world)
         if not self.ended:
             controller.reset(self.seconds, np.array(self.main.x), self.start[1])

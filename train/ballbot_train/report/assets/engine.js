@@ -133,7 +133,7 @@ class Robot {
     else if (arrived) this.ended = "goal";
   }
 
-  /** Counts a control step under a force, to the next state. Tells the violated limit, or −1, and whether it is the goal. */
+  /** Counts a control step under a force, to the next state. Returns the index of the violated limit, or −1, and whether it is the goal. */
   move(force, next) {
     const [cost, ...end] = this.model.outcome(this.x, force, next, this.scenario.constants);
     if (!this.over) this.cost += cost; // an episode's cost ends with it
@@ -167,7 +167,7 @@ class Optimum extends Robot {
   }
 }
 
-/** The way to the goal for somebody who drives: a point of the optimum's path, a second beyond the one that is reached. */
+/** The way to the goal for a driver: a point of the optimum's path, a second beyond the one that is reached. */
 class Guide {
   constructor(scenario) {
     this.states = unpacked(scenario.best.x);
@@ -219,7 +219,7 @@ const STIFFNESS = 60; // 1/s², how a lean is brought to the commanded one
 const DAMPING = 14; // 1/s
 const NOTCHES = 100; // of the stick on the way out: a drive is kept in whole ones, so that a replay is the same
 const LONGEST = 5000; // control steps of a drive that is read
-const SMOOTHING = 0.15; // share of the way to its goal that the stick goes in a control step: keys know no half way
+const SMOOTHING = 0.15; // share of the way to its goal that the stick goes in a control step: keys are pressed or not
 
 /** A human, whose stick commands the lean. The force that gives it follows from one step of the model, linear in the force. */
 class Driver {
@@ -249,7 +249,7 @@ class Driver {
   }
 }
 
-/** A drive once more: nobody else holds the stick. */
+/** Replays a drive: nothing else holds the stick. */
 class Replayed extends Driver {
   constructor(drive) {
     super();

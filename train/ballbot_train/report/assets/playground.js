@@ -32,7 +32,7 @@ class Playground extends Page {
     return input;
   }
 
-  /** Replays the drive of a link; an address that tells of none changes nothing. */
+  /** Replays the drive of a link; an address without one changes nothing. */
   openLinked() {
     const [task, episode, robot = "", letters = ""] = location.hash.replace("#drive=", "").split(".");
     const index = DATA.scenarios.findIndex((scenario) => scenario.task === task && String(scenario.episode) === episode);
@@ -49,7 +49,7 @@ class Playground extends Page {
     return `${location.href.split("#")[0]}#drive=${[task, episode, robot, packedDrive(this.driver.drive)].join(".")}`;
   }
 
-  /** The robot's factors, from the sliders unless they are given, and the scenario anew. */
+  /** The robot's factors, from the sliders unless they are given. Opens the scenario again. */
   setRobot(factors = null, index = this.index) {
     this.sliders.forEach((slider, i) => {
       if (factors) slider.value = Math.round(100 * factors[i]);
@@ -61,7 +61,7 @@ class Playground extends Page {
     this.open(index, Boolean(this.driver));
   }
 
-  /** Opens a scenario; where somebody drives, in an episode whose optimum is known. The drive may be given, as of a link. */
+  /** Opens a scenario. A drive needs an episode with an optimum, and may be given, by a link. */
   open(index, driven = false, given = null) {
     if (driven && DATA.scenarios[index].optimum === null) index = DATA.scenarios.findIndex((scenario) => scenario.optimum !== null);
     this.index = index;
@@ -107,7 +107,7 @@ class Playground extends Page {
   restart(state) {
     for (const robot of this.everyone) robot.reset(state);
     this.forecast = this.driver && new Forecast(this.robots[0], this.scenario);
-    this.disturbed = false; // a regret is that of an episode that nobody disturbs
+    this.disturbed = false; // by a push: a regret is that of an undisturbed episode
     this.time = 0;
     this.late = 0; // s of the episode that are not computed yet
     this.shown = null; // the push whose arrow is shown: {impulse, until}
@@ -141,7 +141,7 @@ class Playground extends Page {
     this.find("text").replaceChildren(`${sentence} Anyone who opens this link sees the drive: `, link);
   }
 
-  /** A push for everyone. Where somebody has fallen, all start again first. */
+  /** A push for every robot. If one has fallen, all start again first. */
   hit(impulse) {
     if (this.isLive) return super.hit(impulse);
     if (!(Math.hypot(...impulse) > 0)) return;
@@ -191,7 +191,7 @@ class Playground extends Page {
     });
     if (this.guide && !this.robots[0].over) robots[0].goal = this.guide.ahead(robots[0].x);
     const paths = this.everyone.map(({ path, look }, i) => ({ points: path, color: look.color, dashed: i > 0 }));
-    // the camera leaves the second robot where it has ended, and both others where somebody drives
+    // the camera does not follow a second robot that has ended, and only the driver's during a drive
     const watched = robots.slice(0, this.driver || this.robots[1].ended ? 1 : 2).map(({ x }) => x);
     this.show({ robots: robots.reverse(), paths: paths.reverse(), markers: this.scenario.markers, watched }, elapsed);
   }
@@ -212,8 +212,8 @@ class Playground extends Page {
   }
 
   /** How much more than the optimum an undisturbed robot has cost so far, or in all once its episode is over.
-   * While somebody drives, it is that of the whole episode if the policy takes over now; where the policy fails from here on, the
-   * least that is still possible is shown, which is that of the cost so far. It is never negative. */
+   * During a drive, the driver's is that of the whole episode if the policy takes over now. If the policy fails from here on, it is
+   * a lower bound, by the cost so far. It is never negative. */
   regret(robot) {
     if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
     if (this.driver && robot === this.robots[0] && !robot.over) {
@@ -226,7 +226,7 @@ class Playground extends Page {
     return robot.over ? `regret ${Math.max(0, share).toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
   }
 
-  /** Who drives holds the stick by drags and keys. */
+  /** During a drive, drags and keys hold the stick. */
   listen() {
     super.listen();
     const view = this.find("view");
@@ -291,7 +291,7 @@ class Playground extends Page {
 
 const ENDS = { goal: "arrived", tilt: "fell", arena: "ran away", force: "gave no number" };
 
-/** How a robot's episode ended, in a word; "" while it goes on. */
-const verdict = (robot) => ENDS[robot.ended] ?? (robot.failed ? "touched" : "");
+/** How a robot's episode ended, in a word; "" before it ends. */
+const verdict = (robot) => ENDS[robot.ended] ?? (robot.failed ? "crashed" : "");
 
 const playground = new Playground();
