@@ -38,7 +38,7 @@ def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
     return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
-def filters(params: BallbotParams) -> tuple[str, ...]:
+def _filters(params: BallbotParams) -> tuple[str, ...]:
     """The filters that may stand in front of controllers of a robot."""
     return tuple(ending[1:] for ending in _experts().FILTERS) if params.wheels is None else (_SENSORS,)
 
@@ -83,27 +83,27 @@ def is_file(name: str) -> bool:
     return not is_expert(name) and (bool(path.suffix) or (path.name != alone and is_run(path)))
 
 
-def is_saved_model(name: str) -> bool:
+def _is_saved_model(name: str) -> bool:
     """Whether a controller's name is the path of a model that Stable-Baselines3 saved."""
     return Path(split(name)[0]).suffix == ".zip"
 
 
-def acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether a task has a controller of that name for a robot; of a file as of `is_made_for`."""
+def _acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
+    """Whether a task has a controller of that name for a robot; of a file as of `_is_made_for`."""
     if is_file(name):
-        return is_made_for(name, task, robot)
+        return _is_made_for(name, task, robot)
     alone, filter = split(name)
-    fits = not filter or filter in filters(named_robot(robot))
+    fits = not filter or filter in _filters(named_robot(robot))
     return name in _experts().VARIANTS or (fits and alone in names(task, robot, None))
 
 
-def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
+def _is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
     """Whether the policy of a file is one for a task and a robot. A saved model tells only its spaces.
 
     Raises:
         PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
     """
-    if is_saved_model(name):
+    if _is_saved_model(name):
         from ballbot_train.policy.saved_models import fits  # it imports torch
 
         return fits(split(name)[0], task, named_robot(robot))
@@ -117,7 +117,7 @@ def made_for(name: str) -> str:
     Raises:
         PolicyError: the file is missing or damaged.
     """
-    if is_saved_model(name):
+    if _is_saved_model(name):
         from ballbot_train.policy.saved_models import read
 
         return f"a task with {read(split(name)[0]).observations} observations"
@@ -152,7 +152,7 @@ def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
         return task
     if not is_file(policy):
         return "stabilize"
-    named = next((name for name in TASKS if is_made_for(policy, make_task(name, robot), robot)), None)
+    named = next((name for name in TASKS if _is_made_for(policy, make_task(name, robot), robot)), None)
     if named is None:
         raise ValueError(
             f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields for the "
@@ -174,7 +174,7 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
         raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
     if not is_file(name):
         raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
-    if is_saved_model(name):
+    if _is_saved_model(name):
         raise ValueError(
             f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
         )
@@ -212,11 +212,11 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
 
 
 def _filtered(controller: Controller, filter: str | None, task: Task, params: BallbotParams) -> Controller:
-    """A controller with one of `filters` in front of it, or with none."""
+    """A controller with one of `_filters` in front of it, or with none."""
     if not filter:
         return controller
-    if filter not in filters(params):
-        known = ", ".join(filters(params))
+    if filter not in _filters(params):
+        known = ", ".join(_filters(params))
         raise ValueError(f"unknown filter {filter!r}; controllers of {robot_name(params)} can have {known}")
     from ballbot_baselines.feedback.adaptive import FilteredController  # it imports CasADi
 
@@ -232,7 +232,7 @@ def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
         raise ValueError(
             f"unknown controller {name!r}; {task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
         )
-    if is_saved_model(name):
+    if _is_saved_model(name):
         from ballbot_train.policy.network import PolicyController  # it imports torch
         from ballbot_train.policy.saved_models import load_actor
 
@@ -252,7 +252,7 @@ def as_controller(policy: Any, task: Task, params: BallbotParams, filter: str | 
             observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
         task: what it is to do.
         params: the robot that it believes to control.
-        filter: one of `filters` that stands in front of it.
+        filter: one of `_filters` that stands in front of it.
 
     Raises:
         TypeError: it is none of these.
@@ -372,7 +372,7 @@ def controllers_by_robot(
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
     chosen: dict[str, dict[str, list[str]]] = {}
     for robot, task in itertools.product(robots, tasks):
-        if found := [name for name in given if acts_in(name, make_task(task, robot), robot)]:
+        if found := [name for name in given if _acts_in(name, make_task(task, robot), robot)]:
             chosen.setdefault(robot, {})[task] = found
     used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
     unused = [name for name in given if name not in used]
