@@ -131,6 +131,7 @@ def check_private(path: Path, variable: str) -> None:
 
 def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str, ...]) -> Path:
     """Compiles into a folder of its own, then renames: two processes at once, or a kill, never leave half a library."""
+    _log.info("compiling %s, once on this machine", stem.rpartition("-")[0])
     # inside the cache, because a rename is atomic within one file system only
     with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
         built = Path(scratch) / f"code{SUFFIX}"

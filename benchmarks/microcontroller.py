@@ -19,7 +19,7 @@ from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, ROBOTS, named_robot, sensors
 from ballbot_gym.rollout import Controller, rollout
-from ballbot_train.evaluation.controllers import FILTERED, make_controller, policy_path
+from ballbot_train.evaluation.controllers import make_controller, policy_path, split
 from ballbot_train.policy.export_c import LQR, export_c
 from ballbot_train.policy.printed import c_number
 
@@ -162,7 +162,8 @@ def main(
 
 
 def _measured(task: str, robot: str, name: str, folder: Path) -> Row:
-    problem, filtered, alone = make_task(task, robot), name.endswith(FILTERED), name.removesuffix(FILTERED)
+    problem, (alone, filter) = make_task(task, robot), split(name)
+    filtered = bool(filter)
     policy = LQR if alone == LQR else policy_path(alone, problem, robot)
     source = export_c(policy, folder / "controller.c", problem, robot, filtered)
     main = _MAIN % {**_episode(task, robot, name, filtered), "repetitions": _REPETITIONS}

@@ -22,15 +22,15 @@ from ballbot_gym.robot import (
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.demos import demos
 from ballbot_train.evaluation.runner import open_run
-from ballbot_train.learning import training
+from ballbot_train.learning import apg, training
 from ballbot_train.learning.demonstrations import DemoConfig
-from ballbot_train.learning.learners import LEARNERS, shac
+from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyNetwork, save_policy
 from ballbot_train.work import jobs
 
 PAPER = named_robot("paper")
-TINY = shac.ShacConfig(iterations=1, evaluations=1, num_envs=2, horizon=2, hidden=(4,))
+TINY = apg.ApgConfig(iterations=1, evaluations=1, num_envs=2, episode_seconds=0.04, hidden=(4,))
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,7 @@ def claim_of_benchmark(out: Path) -> None:
 
 def claim_of_training(out: Path) -> None:
     task = TASKS["stabilize"]()
-    training.train(
-        shac.Shac(task, named_robot("paper"), TINY), task, {"learner": "shac", "task": "stabilize"}, out, True
-    )
+    training.train(apg.Apg(task, named_robot("paper"), TINY), task, {"learner": "apg", "task": "stabilize"}, out, True)
 
 
 def claim_of_demos(out: Path) -> None:
@@ -221,9 +219,9 @@ def test_training_a_robot_without_a_name_is_refused(tmp_path: Path, monkeypatch:
         with pytest.raises(ValueError, match=r"this robot has no name.*register_robot"):
             learner.make(task, light, learner.settings("stabilize"), 0)
     monkeypatch.setitem(ROBOTS, "light", Robot(light, {}))
-    made = shac.Shac(task, light, TINY)
+    made = apg.Apg(task, light, TINY)
     with pytest.raises(ValueError, match="""the learner trains 'light', and "robot" of config is 'paper'"""):
-        training.train(made, task, {"learner": "shac", "task": "stabilize"}, tmp_path)
+        training.train(made, task, {"learner": "apg", "task": "stabilize"}, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

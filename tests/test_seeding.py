@@ -15,8 +15,8 @@ from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import BallbotVecEnv
 from ballbot_train.evaluation import fresh, runner
-from ballbot_train.learning import demonstrations
-from ballbot_train.learning.learners import LEARNERS, dagger
+from ballbot_train.learning import dagger, demonstrations
+from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.rsl import RslVecEnv
 
 ENVS = 64

@@ -21,7 +21,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import ROBOT_FACTORS, TRACKS, Randomization, default_params
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_train import evaluate
+from ballbot_train import evaluate, load_policy
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.controllers import controllers_of, make_controller
 from ballbot_train.evaluation.fresh import as_batch_policy, evaluate_fresh
@@ -133,6 +133,13 @@ def test_a_batch_of_filters_does_what_one_does():
 def test_a_policy_file_may_be_named_with_its_filter():
     named = f"{shipped_policies(make_task('stabilize'))['shac']}-ekf"
     by_path, by_name = (evaluate(name, "stabilize", 1, "rk4", randomization="noisy") for name in (named, "shac-ekf"))
+    alone = load_policy(shipped_policies(make_task("stabilize"))["shac"])
+    for policy in ("shac", alone):
+        filtered = evaluate(policy, "stabilize", 1, "rk4", randomization="noisy", filter="ekf")
+        assert filtered.cost_mean == by_name.cost_mean
+        assert filtered.controller.endswith("-ekf")
+    with pytest.raises(ValueError, match="shac-ekf has a filter in front of it already"):
+        evaluate("shac-ekf", "stabilize", 1, "rk4", filter="adaptive")
     assert by_path.regret_mean == by_name.regret_mean
 
 

@@ -4,6 +4,7 @@
 """
 
 import difflib
+import logging
 import os
 import re
 import shlex
@@ -20,7 +21,7 @@ from typing import Any
 try:
     from rich.table import Table
 
-    from ballbot_train.work.console import PlainConsole
+    from ballbot_train.work.console import PlainConsole, console
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 
@@ -128,12 +129,29 @@ def _call(command: str, options: list[str]) -> Any:
     # Before torch, NumPy or CasADi are imported, here and in the processes of this one: these nets and batches are too small
     # for a second thread, and beside other work threads wait for each other at every operation.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    _announce_compilation()
     options = _registered(options)
     function = load(COMMANDS[command])
     # the options of some commands depend on what is typed, so these commands parse it themselves
     if parse := getattr(sys.modules[function.__module__], "command_line", None):
         return parse(options)
     return tyro.cli(function, args=options, prog=f"ballbot {command}")
+
+
+class _Lines(logging.Handler):
+    """Prints what is logged."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        console.print(record.getMessage(), soft_wrap=True)
+
+
+def _announce_compilation() -> None:
+    """Says what is compiled: the first call of a task takes long, and no bar moves meanwhile."""
+    log = logging.getLogger("ballbot_gym.machine_code")
+    if not any(isinstance(handler, _Lines) for handler in log.handlers):
+        log.addHandler(_Lines(logging.INFO))
+        log.setLevel(logging.INFO)
+        log.propagate = False
 
 
 def _registered(options: list[str]) -> list[str]:

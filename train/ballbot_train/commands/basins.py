@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from ballbot_gym.robot import PAPER
-from ballbot_train.commands.options import WorkersOption
+from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import basins as maps
-from ballbot_train.evaluation.controllers import controllers_of
+from ballbot_train.evaluation.controllers import all_behind, controllers_of
 from ballbot_train.evaluation.names import ways_on, with_way
 from ballbot_train.evaluation.runner import open_run
 from ballbot_train.report import figures
@@ -21,6 +21,7 @@ def basins(
     out: Path = Path("runs/basins"),
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
+    filter: Filter | None = None,
 ) -> None:
     """Maps for Stabilize from which leans, speeds and lean rates each controller recovers, within what the robot allows.
 
@@ -31,10 +32,11 @@ def basins(
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
         workers: who does the work.
         robot: whose limits and controllers.
+        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
-    chosen = controllers_of([maps.TASK], controllers, robot)
+    chosen = controllers_of([maps.TASK], all_behind(controllers, filter), robot)
     physics = physics_or_default(physics, robot)
     names = chosen[maps.TASK]
     facts = open_run(out, workers, {robot: chosen}, robot, physics=physics, points=points)

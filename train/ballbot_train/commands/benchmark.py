@@ -6,9 +6,9 @@ from typing import Any
 from ballbot_gym import certified, files
 from ballbot_gym.robot import PAPER, Ballbot, checked_randomization, named_robot
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import WorkersOption
+from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness
-from ballbot_train.evaluation.controllers import controllers_of
+from ballbot_train.evaluation.controllers import all_behind, controllers_of
 from ballbot_train.evaluation.results import (
     HEADER,
     TABLE,
@@ -35,6 +35,7 @@ def benchmark(
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
     randomization: tuple[str, ...] = (),
+    filter: Filter | None = None,
 ) -> None:
     """Compares controllers by their regret on the certified episodes, and writes a leaderboard with figures.
 
@@ -51,8 +52,9 @@ def benchmark(
         randomization: names of tracks, "unknown", "late", "noisy" or "real": robots, delays and sensors that nobody told the
             controllers. Then the result is one table of controllers by tracks, with the parts of their regret; by default
             with the experts that are made for each track.
+        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
-    chosen = controllers_of(tasks, controllers, robot, tracks=bool(randomization))
+    chosen = controllers_of(tasks, all_behind(controllers, filter), robot, tracks=bool(randomization))
     physics = physics_or_default(physics, robot)
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:

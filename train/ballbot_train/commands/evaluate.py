@@ -11,8 +11,8 @@ from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, Randomization, checked_randomization, file_name, track_of
 from ballbot_gym.rollout import rollout
-from ballbot_train.commands.options import WorkersOption
-from ballbot_train.evaluation.controllers import controllers_of, make_controller, policy_digests, task_name
+from ballbot_train.commands.options import Filter, WorkersOption
+from ballbot_train.evaluation.controllers import behind, controllers_of, make_controller, policy_digests, task_name
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.evaluation.results import TABLE, leaderboard, write_leaderboard
 from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
@@ -49,6 +49,7 @@ def evaluate(
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
     randomization: str | None = None,
+    filter: Filter | None = None,
 ) -> None:
     """Runs a controller on the certified episodes; or with --fresh on thousands of fresh ones, with all that failed.
 
@@ -67,9 +68,10 @@ def evaluate(
         workers: who runs certified episodes, and finds optima.
         robot: whose episodes.
         randomization: name of the track on which the episodes are, of robots and delays that are hidden from the policy.
+        filter: in front of the policy: it acts on what this estimates of the robot, the delay or, of sensors, the state.
     """
     varied = checked_randomization(randomization)
-    task = task_name(policy, task, robot)
+    task, policy = task_name(policy, task, robot), behind(policy, filter)
     chosen = controllers_of([task], [policy], robot)
     check_least(0, optima=optima or 0)
     named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")

@@ -5,7 +5,7 @@ from typing import Literal
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, file_name, named_robot
-from ballbot_train.evaluation.controllers import FILTERED, policy_path, task_name
+from ballbot_train.evaluation.controllers import behind, policy_path, split, task_name
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.work.console import RobotName, console
 
@@ -18,6 +18,7 @@ def export(
     out: Path | None = None,
     robot: RobotName = PAPER,
     prefix: str = "ballbot",
+    filter: Literal["ekf"] | None = None,
 ) -> None:
     """Writes a policy as an ONNX or a C file, which needs neither Python nor torch to run.
 
@@ -26,16 +27,17 @@ def export(
     as a comment, and a test of itself.
 
     Args:
-        policy: a policy file, or the name of a policy that comes with the package; for C also lqr. For C of a robot with
-            wheels -ekf may follow: then it takes what the robot's sensors show.
+        policy: a policy file, or the name of a policy that comes with the package; for C also lqr.
         task: name of its task; default the one that its file names, or else stabilize.
         format: onnx or c.
         out: path of the file; default runs/export/TASK-POLICY with the ending .onnx or .c.
         robot: name of the policy's robot.
         prefix: how the names in a C file begin; give each controller of one program another.
+        filter: ekf, for C of a robot with wheels: the file then takes what the robot's sensors show.
     """
-    filtered = policy.endswith(FILTERED) and format == "c" and named_robot(robot).SENSORS
-    name, policy = file_part(policy), policy.removesuffix(FILTERED) if filtered else policy
+    policy = behind(policy, filter)
+    filtered = split(policy)[1] == "ekf" and format == "c" and named_robot(robot).SENSORS
+    name, policy = file_part(policy), split(policy)[0] if filtered else policy
     task = task_name(policy, task, robot)
     problem = make_task(task, robot)
     source = policy if (policy, format) == ("lqr", "c") else policy_path(policy, problem, robot)

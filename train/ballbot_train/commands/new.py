@@ -35,10 +35,10 @@ def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: 
     del kind  # there is one
     check_name(name, "task")
     check_least(0, episodes=episodes)
-    if name in TASKS or id_of(name) in gymnasium.registry or module_of(name) in _OURS:
+    if name in TASKS or _id_of(name) in gymnasium.registry or _module_of(name) in _OURS:
         raise ValueError(f"there is a task {name!r} already, or a package of ours of that name; give another name")
     texts = files_of(name)
-    if (called := kind_of(name)) in _names_in(texts[f"{module_of(name)}.py"]):
+    if (called := kind_of(name)) in _names_in(texts[f"{_module_of(name)}.py"]):
         raise ValueError(f"the task's class would be {called!r}, which means something else there; give another name")
     out = Path(name) if out is None else out
     if there := [path for path in (*texts, "leaderboard.md") if (out / path).exists()]:
@@ -54,8 +54,8 @@ def files_of(name: str) -> dict[str, str]:
     """The files of a task's package by their names, as text."""
     import jinja2  # no other command needs it
 
-    module = module_of(name)
-    values = {"name": name, "kind": kind_of(name), "module": module, "id": id_of(name)}
+    module = _module_of(name)
+    values = {"name": name, "kind": kind_of(name), "module": module, "id": _id_of(name)}
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
@@ -68,7 +68,7 @@ def files_of(name: str) -> dict[str, str]:
     return {path: environment.get_template(f"{template}.j2").render(values) for path, template in templates.items()}
 
 
-def module_of(name: str) -> str:
+def _module_of(name: str) -> str:
     """The module of a task's package."""
     return f"ballbot_{name}"
 
@@ -78,7 +78,7 @@ def kind_of(name: str) -> str:
     return "".join(part.capitalize() for part in name.split("_"))
 
 
-def id_of(name: str) -> str:
+def _id_of(name: str) -> str:
     """The Gymnasium id of a task's package."""
     return f"Ballbot{kind_of(name)}-v0"
 
@@ -93,7 +93,7 @@ def _names_in(source: str) -> set[str]:
 def _leaderboard(name: str, out: Path, episodes: int) -> str:
     """What experts reach in the task, as Markdown."""
     sys.path.append(os.path.abspath(out))
-    import_module(module_of(name))
+    import_module(_module_of(name))
     physics = physics_or_default(None)
     rows = [cells(evaluate(expert, name, episodes, physics)) for expert in _FIRST]
     command = f"ballbot benchmark --tasks {name} --controllers {' '.join(_FIRST)} --episodes {episodes}"

@@ -1,12 +1,15 @@
 """Options that several commands share."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from ballbot_gym.lazy import imports_of
 from ballbot_train.work.executors import Workers
 
 with imports_of(__name__):
     import tyro
+
+Filter = Literal["adaptive", "ekf", "adaptive-ekf"]
+"""The filters that --filter can put in front of controllers."""
 
 UNNAMED = tyro.conf.arg(name="")
 """Of a dataclass whose fields are options of their own names."""

@@ -6,6 +6,8 @@ from pathlib import Path
 from ballbot_gym.engines import default_physics
 from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import Filter
+from ballbot_train.evaluation.controllers import all_behind
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
 from ballbot_train.report.replay import certified_replay, file_replay
@@ -30,6 +32,7 @@ def replay(
     out: Path = Path("runs/replay"),
     robot: RobotName = PAPER,
     frictions: tuple[float, ...] = (),
+    filter: Filter | None = None,
 ) -> None:
     """Draws a certified episode under controllers, or trajectory files: a strip of pictures, or a film.
 
@@ -48,6 +51,7 @@ def replay(
         robot: whose episode; a trajectory file is drawn with the paper's.
         frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of
             them. Where the ball slips, its path is red.
+        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
     _check(1 <= fps <= 1000, f"fps must be 1 to 1000, not {fps}")
     _check(1 <= frames <= 100, f"frames must be 1 to 100, not {frames}")
@@ -64,6 +68,7 @@ def replay(
         _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
         check_names("task", source, TASKS)
         _check(bool(controllers), "give at least one controller")
+        controllers = tuple(all_behind(controllers, filter))
         shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)
         made = file_name(source[0], robot)
         # parts of names hold no plus, so that no other controllers or floors make the same name

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import WorkersOption
+from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness as stressed
-from ballbot_train.evaluation.controllers import controllers_of
+from ballbot_train.evaluation.controllers import all_behind, controllers_of
 from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
 from ballbot_train.evaluation.runner import checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
@@ -25,6 +25,7 @@ def robustness(
     out: Path = Path("runs/robustness"),
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
+    filter: Filter | None = None,
 ) -> None:
     """Runs the certified episodes under pushes, noise, delay, lag and other robots, and draws success and regret by severity.
 
@@ -38,8 +39,9 @@ def robustness(
         out: folder of the results; an interrupted run continues here.
         workers: who does the work.
         robot: whose episodes and controllers.
+        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
-    chosen = controllers_of(tasks, controllers, robot)
+    chosen = controllers_of(tasks, all_behind(controllers, filter), robot)
     if not controllers:
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
     physics = physics_or_default(physics, robot)

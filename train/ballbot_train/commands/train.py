@@ -70,7 +70,7 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
         settings: the learner's settings; default, those tuned for the task.
         command: the command that was typed, for the record; default, one with all settings.
     """
-    check_learner(learner)
+    _check_learner(learner)
     check_names("task", [run.task], TASKS)
     check_ranges(run)
     if run.out is None:
@@ -136,7 +136,7 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
     }
 
 
-def check_learner(name: str) -> None:
+def _check_learner(name: str) -> None:
     """Raises a ValueError where there is no learner of that name."""
     if name in _RENAMED:
         raise ValueError(_RENAMED[name])
@@ -187,7 +187,7 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
             args=list(arguments),
         )
         return
-    check_learner(named)
+    _check_learner(named)
     check_names("task", [known.task], TASKS)
     settings = LEARNERS[named].settings(known.task, {known.demos, known.start} - {None, "None"} != set())
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import WorkersOption
-from ballbot_train.evaluation.controllers import controllers_by_robot
+from ballbot_train.commands.options import Filter, WorkersOption
+from ballbot_train.evaluation.controllers import all_behind, controllers_by_robot
 from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
 from ballbot_train.evaluation.runner import Group, checked_episodes, floor, open_run, publish, run_groups
 from ballbot_train.work.console import Physics, RobotName, check_some, console, physics_or_default
@@ -45,6 +45,7 @@ def transfer(
     seed: int = 0,
     out: Path = Path("runs/transfer"),
     workers: WorkersOption = Workers(),
+    filter: Filter | None = None,
 ) -> None:
     """Runs controllers that were made for one robot on another: success, falls and cost over that robot's optimum.
 
@@ -60,11 +61,12 @@ def transfer(
         seed: of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: who does the work.
+        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
     check_some("robot", made_for, ROBOTS)
     for friction in frictions:
         floor(robot, friction)
-    chosen = controllers_by_robot(tasks, controllers, made_for)
+    chosen = controllers_by_robot(tasks, all_behind(controllers, filter), made_for)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
     engines, episodes = [physics_or_default(one, robot) for one in physics or (None,)], checked_episodes(episodes)

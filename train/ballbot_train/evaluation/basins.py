@@ -30,7 +30,7 @@ _DOUBT = 2.0  # degrees beyond the boundary that are run too, because it is only
 
 
 @dataclass(frozen=True)
-class Axis:
+class _Axis:
     """The other component of a map, from −limit to limit."""
 
     component: int
@@ -39,7 +39,7 @@ class Axis:
     label: str
 
 
-AXES: dict[str, Axis] = {"speed": Axis(4, 15.0, "speed ẋ, m/s"), "lean rate": Axis(6, 15.0, "lean rate γ̇, rad/s")}
+AXES: dict[str, _Axis] = {"speed": _Axis(4, 15.0, "speed ẋ, m/s"), "lean rate": _Axis(6, 15.0, "lean rate γ̇, rad/s")}
 
 
 @dataclass(frozen=True)

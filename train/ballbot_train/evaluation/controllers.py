@@ -14,15 +14,15 @@ from typing import Any, cast
 import numpy as np
 
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, Robot, named_robot, robot_name
+from ballbot_gym.robot import PAPER, ROBOTS, Robot, named_robot, robot_name
 from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.policy import files as policy_files
 from ballbot_train.policy.files import PolicyError, is_run, read_description, shipped_policies, weights_digest
 from ballbot_train.work.console import check_names, check_some
 
-FILTERED = "-ekf"
-"""Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
+_SENSORS = "ekf"
+"""The filter for robots with wheels: it makes the state from sensors."""
 
 
 def _experts() -> ModuleType:
@@ -37,57 +37,88 @@ def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
     return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
-def filters(params: Robot) -> tuple[str, ...]:
-    """What may follow the names of controllers of a robot."""
-    return _experts().FILTERS if params.TRACK_FILTERS else (FILTERED,)
+def _filters(params: Robot) -> tuple[str, ...]:
+    """The filters that may stand in front of controllers of a robot."""
+    return tuple(ending[1:] for ending in _experts().FILTERS) if params.TRACK_FILTERS else (_SENSORS,)
 
 
-def plain(name: str) -> str:
-    """The name of a controller without the filter in front of it."""
-    return name if name in _experts().VARIANTS else name.removesuffix(_filter_of(name))
+def split(name: str) -> tuple[str, str]:
+    """A controller's name without its filter, and the filter or "": "shac-adaptive-ekf" is ("shac", "adaptive-ekf")."""
+    ending = next((ending for ending in _experts().FILTERS if name.endswith(ending)), "")
+    return name.removesuffix(ending), ending[1:]
 
 
-def _filter_of(name: str) -> str:
-    """Which of `FILTERS` a name ends with, or ""."""
-    return next((ending for ending in _experts().FILTERS if name.endswith(ending)), "")
+def behind(name: str, filter: str | None) -> str:
+    """The name of a controller with a filter in front of it, as `split` takes it apart.
+
+    Raises:
+        ValueError: there is one in front of it already.
+    """
+    if filter and split(name)[1]:
+        raise ValueError(f"{name} has a filter in front of it already; leave out --filter, or write {split(name)[0]}")
+    return f"{name}-{filter}" if filter else name
+
+
+def all_behind(given: Sequence[str], filter: str | None) -> list[str]:
+    """As `behind`, of every controller that is named.
+
+    Raises:
+        ValueError: none is.
+    """
+    if filter and not given:
+        raise ValueError("a filter needs controllers that it stands in front of; give --controllers with --filter")
+    return [behind(name, filter) for name in given]
+
+
+def of_other_robot(name: str, task: Task) -> str:
+    """What to type for a policy of a task that comes with the package for other robots; "" of another name."""
+    robots = [robot for robot in ROBOTS if name in shipped_policies(task, robot, None)]
+    if not robots:
+        return ""
+    plural = "s" if len(robots) > 1 else ""
+    return (
+        f"it was made for the robot{plural} {', '.join(robots)}: `ballbot transfer --made-for {robots[0]} "
+        f"--controllers {name} --robot YOURS` runs it on yours"
+    )
 
 
 def is_expert(name: str) -> bool:
     """Whether a name is an expert's or a variant's, and no policy's."""
-    return plain(name) in _experts().CONTROLLERS | _experts().VARIANTS
+    return split(name)[0] in _experts().CONTROLLERS | _experts().VARIANTS
 
 
 def is_file(name: str) -> bool:
     """Whether a controller's name is the path of a policy file, of a run's folder with one, or of a saved model."""
-    path = Path(plain(name))
-    return not is_expert(name) and (bool(path.suffix) or (path.name != plain(name) and is_run(path)))
+    alone, _ = split(name)
+    path = Path(alone)
+    return not is_expert(name) and (bool(path.suffix) or (path.name != alone and is_run(path)))
 
 
-def is_saved_model(name: str) -> bool:
+def _is_saved_model(name: str) -> bool:
     """Whether a controller's name is the path of a model that Stable-Baselines3 saved."""
-    return Path(plain(name)).suffix == ".zip"
+    return Path(split(name)[0]).suffix == ".zip"
 
 
-def acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether a task has a controller of that name for a robot; of a file as of `is_made_for`."""
+def _acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
+    """Whether a task has a controller of that name for a robot; of a file as of `_is_made_for`."""
     if is_file(name):
-        return is_made_for(name, task, robot)
-    ending = _filter_of(name)
-    behind = not ending or ending in filters(named_robot(robot))
-    return name in _experts().VARIANTS or (behind and name.removesuffix(ending) in names(task, robot, None))
+        return _is_made_for(name, task, robot)
+    alone, filter = split(name)
+    fits = not filter or filter in _filters(named_robot(robot))
+    return name in _experts().VARIANTS or (fits and alone in names(task, robot, None))
 
 
-def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
+def _is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
     """Whether the policy of a file is one for a task and a robot. A saved model tells only its spaces.
 
     Raises:
         PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
     """
-    if is_saved_model(name):
+    if _is_saved_model(name):
         from ballbot_train.policy.saved_models import fits  # it imports torch
 
-        return fits(plain(name), task, named_robot(robot))
-    spec = read_description(plain(name))["spec"]
+        return fits(split(name)[0], task, named_robot(robot))
+    spec = read_description(split(name)[0])["spec"]
     return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
 
@@ -97,11 +128,11 @@ def made_for(name: str) -> str:
     Raises:
         PolicyError: the file is missing or damaged.
     """
-    if is_saved_model(name):
+    if _is_saved_model(name):
         from ballbot_train.policy.saved_models import read
 
-        return f"a task with {read(plain(name)).observations} observations"
-    spec = read_description(plain(name))["spec"]
+        return f"a task with {read(split(name)[0]).observations} observations"
+    spec = read_description(split(name)[0])["spec"]
     robot = spec.get("robot", PAPER)
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
@@ -110,13 +141,13 @@ def policy_digest(name: str, task: Task, robot: str | Robot = PAPER) -> str:
     """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
     if is_expert(name):
         return ""
-    robot, name = robot if isinstance(robot, str) else robot_name(robot), plain(name)
+    robot, name = robot if isinstance(robot, str) else robot_name(robot), split(name)[0]
     return weights_digest(shipped_policies(task, robot, None).get(name, name))
 
 
 def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
-    """Digest of the network of a policy by name or file, as its description says; see `policy_files.network_digest`."""
-    name = plain(name)
+    """Digest of the network of a policy by name or file, as its description says; see `policy.files.network_digest`."""
+    name = split(name)[0]
     return policy_files.network_digest(shipped_policies(task, robot, None).get(name, name))
 
 
@@ -132,7 +163,7 @@ def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
         return task
     if not is_file(policy):
         return "stabilize"
-    named = next((name for name in TASKS if is_made_for(policy, make_task(name, robot), robot)), None)
+    named = next((name for name in TASKS if _is_made_for(policy, make_task(name, robot), robot)), None)
     if named is None:
         raise ValueError(
             f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields for the "
@@ -154,7 +185,7 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
         raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
     if not is_file(name):
         raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
-    if is_saved_model(name):
+    if _is_saved_model(name):
         raise ValueError(
             f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
         )
@@ -174,7 +205,7 @@ def make_controller(name: str, task: Task, params: Robot) -> Controller:
 
     Args:
         name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
-            or of a model that Stable-Baselines3 saved; see `saved_models`. One of `filters(params)` may follow.
+            or of a model that Stable-Baselines3 saved; see `saved_models`. A filter may follow, see `split`.
         task: what it is to do.
         params: the robot it believes to control.
 
@@ -184,15 +215,23 @@ def make_controller(name: str, task: Task, params: Robot) -> Controller:
     """
     if name in _experts().VARIANTS and params.TRACK_FILTERS:
         return _experts().VARIANTS[name](task, params)
-    ending = _filter_of(name)
-    controller = _unfiltered(name.removesuffix(ending), task, params)
-    if getattr(controller, "told", None) is not None:  # it wants to be told the robot
-        ending = ending or "-adaptive"
-    if not ending:
+    alone, filter = split(name)
+    controller = _unfiltered(alone, task, params)
+    if getattr(controller, "told", None) is not None:  # it needs an estimate of the robot
+        filter = filter or "adaptive"
+    return _filtered(controller, filter, task, params)
+
+
+def _filtered(controller: Controller, filter: str | None, task: Task, params: Robot) -> Controller:
+    """A controller with one of `_filters` in front of it, or with none."""
+    if not filter:
         return controller
+    if filter not in _filters(params):
+        known = ", ".join(_filters(params))
+        raise ValueError(f"unknown filter {filter!r}; controllers of {robot_name(params)} can have {known}")
     from ballbot_baselines.feedback.adaptive import FilteredController  # it imports CasADi
 
-    return FilteredController(task, params, ending, controller)
+    return FilteredController(task, params, f"-{filter}", controller)
 
 
 def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
@@ -201,10 +240,9 @@ def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
     robot = robot_name(params)
     shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):
-        raise ValueError(
-            f"unknown controller {name!r}; {task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
-        )
-    if is_saved_model(name):
+        known = f"{task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
+        raise ValueError(f"unknown controller {name!r}; {of_other_robot(name, task) or known}")
+    if _is_saved_model(name):
         from ballbot_train.policy.network import PolicyController  # it imports torch
         from ballbot_train.policy.saved_models import load_actor
 
@@ -214,7 +252,7 @@ def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
     return load_policy(shipped.get(name, name), task, params)
 
 
-def as_controller(policy: Any, task: Task, params: Robot) -> Controller:
+def as_controller(policy: Any, task: Task, params: Robot, filter: str | None = None) -> Controller:
     """Anything that acts, as a Controller.
 
     Args:
@@ -224,13 +262,18 @@ def as_controller(policy: Any, task: Task, params: Robot) -> Controller:
             observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
         task: what it is to do.
         params: the robot that it believes to control.
+        filter: one of `_filters` that stands in front of it.
 
     Raises:
         TypeError: it is none of these.
         ValueError, PolicyError: as `make_controller`; or the model was trained in other spaces than the env's.
     """
     if isinstance(policy, str | Path):
-        return make_controller(str(policy), task, params)
+        return make_controller(behind(str(policy), filter), task, params)
+    return _filtered(_acting(policy, task, params), filter, task, params)
+
+
+def _acting(policy: Any, task: Task, params: Robot) -> Controller:
     if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
         return policy
     if callable(getattr(policy, "predict", None)):
@@ -339,12 +382,15 @@ def controllers_by_robot(
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
     chosen: dict[str, dict[str, list[str]]] = {}
     for robot, task in itertools.product(robots, tasks):
-        if found := [name for name in given if acts_in(name, make_task(task, robot), robot)]:
+        if found := [name for name in given if _acts_in(name, make_task(task, robot), robot)]:
             chosen.setdefault(robot, {})[task] = found
     used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
     unused = [name for name in given if name not in used]
     if unused and is_file(unused[0]):
         raise ValueError(f"{unused[0]} was made for {made_for(unused[0])}, which is none of {', '.join(tasks)}")
+    for task in tasks if unused else ():
+        if hint := of_other_robot(unused[0], make_task(task, robots[0])):
+            raise ValueError(f"unknown controller {unused[0]} for the robot {robots[0]}; {hint}")
     check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
     return chosen
 

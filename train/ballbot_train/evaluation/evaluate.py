@@ -16,7 +16,7 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robot import PAPER, Randomization, Robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.controllers import as_controller, is_file, policy_digest
+from ballbot_train.evaluation.controllers import as_controller, behind, is_file, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.evaluation.runner import checked_episodes, run_episodes, shown_to
 from ballbot_train.work.console import late_bar
@@ -38,6 +38,7 @@ def evaluate(
     robot: str | Robot = ...,
     workers: int | Workers = ...,
     out: str | Path | None = ...,
+    filter: str | None = ...,
     fresh: None = None,
 ) -> Row: ...
 
@@ -53,6 +54,7 @@ def evaluate(
     robot: str | Robot = ...,
     workers: int | Workers = ...,
     out: str | Path | None = ...,
+    filter: str | None = ...,
     *,
     fresh: int,
 ) -> "FreshResult": ...
@@ -68,6 +70,7 @@ def evaluate(
     robot: str | Robot = PAPER,
     workers: int | Workers = 1,
     out: str | Path | None = None,
+    filter: str | None = None,
     fresh: int | None = None,
 ) -> "Row | FreshResult":
     """The leaderboard row of anything that acts, on certified episodes; or, with `fresh`, what it does on fresh episodes.
@@ -89,6 +92,7 @@ def evaluate(
             does: what it does must be under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
             Rows of other policies and tasks that are there already stay.
+        filter: the filter in front of the policy, "adaptive", "ekf" or "adaptive-ekf": the policy acts on what it estimates.
         fresh: instead of certified episodes, the number of fresh ones: then this is `evaluate_fresh`, in the batched
             closed-form model.
 
@@ -105,17 +109,18 @@ def evaluate(
                 "fresh episodes run in the batched closed-form model, and write no folder; leave out physics and out"
             )
         named_robot = robot if isinstance(robot, str) else robot_name(robot)
+        policy = behind(str(policy), filter) if filter else policy
         return evaluate_fresh(policy, task, fresh, name=name, robot=named_robot, randomization=randomization)
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = range(checked_episodes(episodes))
-        controller = as_controller(policy, env.task, env.params)
+        controller = as_controller(policy, env.task, env.params, filter)
         env = shown_to(controller, env)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         file = str(Path(policy).absolute()) if isinstance(policy, str | Path) and is_file(str(policy)) else ""
         held = None if out is None else _Held.of(Path(out))
         on = name_of(env.task) or type(env.task).__name__.lower()
-        named = name or _name(policy, file, on, held), on
+        named = name or behind(_name(policy, file, on, held), filter), on
         motions: list[recordings.Recording] = []
         with late_bar("episodes", len(indices)) as advance:
             results = run_episodes(env, controller, *named, indices, 0, known, motions, advance)

@@ -51,7 +51,7 @@ _MOST_BINS = 80
 
 
 @dataclass(frozen=True)
-class Summary:
+class _Summary:
     """What a policy does on fresh episodes, in numbers. Intervals are Wilson's, of 95 %."""
 
     episodes: int
@@ -117,14 +117,14 @@ class FreshResult:
         regrets = (self.costs[:k] / self.optima - 1)[~self.failure[:k]]
         return regrets[np.isfinite(regrets)]
 
-    def summary(self) -> Summary:
+    def summary(self) -> _Summary:
         """The numbers."""
         n, failures = len(self), int(self.failure.sum())
         success = int(self.success.sum())
         success_low, success_high = share_interval(success, n)
         failures_low, failures_high = share_interval(failures, n)
         kinds = [name.partition(" ")[0] for name in self.violated if name]  # "obstacle 3" is an obstacle
-        return Summary(
+        return _Summary(
             episodes=n,
             success=success / n,
             success_low=success_low,

@@ -36,7 +36,7 @@ def digest_of(entry: Entry) -> str:
     return digest([row[name] for name in _VERIFIED])
 
 
-def read_released(folder: Path = LEADERBOARD) -> dict[str, str]:
+def _read_released(folder: Path = LEADERBOARD) -> dict[str, str]:
     """The digests of the rows whose submissions are in releases, by the names of the rows' files."""
     path, listed = folder / LIST, {}
     for line in files.read(path).decode().splitlines() if path.exists() else ():
@@ -62,7 +62,7 @@ def unbacked(
         downloaded: folder with the submissions of releases. If it is given, the list of released rows decides nothing: each
             row needs its submission, whose SHA-256 the row holds, and it is verified again.
     """
-    entries, released = read_entries(folder), read_released(folder)
+    entries, released = read_entries(folder), _read_released(folder)
     found_in = {} if downloaded is None else {_sha256(path): path for path in sorted(downloaded.rglob("*.npz"))}
     found = {path.name for path in folder.glob("*.json")}
     wrong = [f"{name}: the row is missing, and {LIST} has it" for name in released.keys() - found]

@@ -29,7 +29,7 @@ from ballbot_train.policy.files import track_in
 
 
 @dataclass(frozen=True)
-class Stress:
+class _Stress:
     """One kind of disturbance, by severity; severity 0 is none."""
 
     label: str
@@ -43,13 +43,13 @@ def _both(value: float) -> tuple[float, float]:
     return value, value
 
 
-STRESSES: dict[str, Stress] = {
-    "push": Stress(
+STRESSES: dict[str, _Stress] = {
+    "push": _Stress(
         "impulse of pushes on the ball, one in 2 s, N·s",
         (1.0, 2.0, 4.0, 8.0),
         lambda impulse: Randomization(push_impulse=_both(impulse), push_interval=2.0),
     ),
-    "noise": Stress(
+    "noise": _Stress(
         "sensor noise × (1 cm, 0.01 rad, 5 cm/s, 0.05 rad/s)",
         (0.5, 1.0, 2.0, 4.0),
         lambda factor: Randomization(
@@ -57,20 +57,20 @@ STRESSES: dict[str, Stress] = {
             **dict.fromkeys(("velocity_noise", "lean_rate_noise"), 0.05 * factor),
         ),
     ),
-    "delay": Stress(
+    "delay": _Stress(
         "delay of the force, ms", (20.0, 40.0, 60.0), lambda ms: Randomization(actuator_delay=_both(1e-3 * ms))
     ),
-    "lag": Stress(
+    "lag": _Stress(
         "time constant of the actuator, ms",
         (10.0, 20.0, 40.0, 60.0),
         lambda ms: Randomization(actuator_lag=_both(1e-3 * ms)),
     ),
-    "mass": Stress(
+    "mass": _Stress(
         "error of both masses, %",
         (-20.0, -10.0, 10.0, 20.0),
         lambda percent: Randomization(**dict.fromkeys(("body_mass", "ball_mass"), _both(1 + 0.01 * percent))),
     ),
-    "com": Stress(
+    "com": _Stress(
         "error of the centre of mass's height, %",
         (-20.0, -10.0, 10.0, 20.0),
         lambda percent: Randomization(com_height=_both(1 + 0.01 * percent)),

@@ -80,7 +80,7 @@ def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: flo
         values: what the critic expects.
         living: value of a state without any cost, so that the cost to go is `living` minus the value.
     """
-    relative = (returns - values) / cost_to_go(values, living)
+    relative = (returns - values) / _cost_to_go(values, living)
     return (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
@@ -92,13 +92,13 @@ def weigh_gradients(values: Sequence[torch.Tensor], living: float) -> None:
     if not values[0].requires_grad:
         return
     lowest = torch.stack([value.detach() for value in values]).amin(0)
-    weights = cost_to_go(lowest, living) ** -1
+    weights = _cost_to_go(lowest, living) ** -1
     weights /= weights.mean()
     for value in values:
         value.register_hook(lambda gradient: gradient * weights)
 
 
-def cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
+def _cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
     """The costs to go that values of any shape stand for, but no less than a share of their mean.
 
     Args:

@@ -146,7 +146,7 @@ class ModelFree(ABC):
             self._pay,
             **world,
         )
-        self._env = TrainingEnv(batch, self._reward_scale, frame)
+        self._env = _TrainingEnv(batch, self._reward_scale, frame)
 
     def _set_model(
         self,
@@ -329,7 +329,7 @@ class ModelFree(ABC):
             (self._imitation_weight * (1 - self._progress) * loss).backward()
 
 
-class TrainingEnv(BallbotVecEnv):
+class _TrainingEnv(BallbotVecEnv):
     """The envs of a batch for learning, with scaled rewards.
 
     Their episodes may be shorter than the task's, and the optimal policy stays the same. An episode that runs out of time is
@@ -367,7 +367,7 @@ class TrainingEnv(BallbotVecEnv):
         return self._seen(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
-        super().step_async(actions if self._frame is None else to_world(self._axes, actions))
+        super().step_async(actions if self._frame is None else _to_world(self._axes, actions))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observation, reward, done, infos = super().step_wait()
@@ -429,7 +429,7 @@ def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*parts), -1).astype(np.float32)
 
 
-def to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def _to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """Actions (n, 2) in [-1, 1] of the frame whose directions are the columns of axes (n, 2, 2), as actions of the world.
 
     Times `REACH` and turned they include all of the world's, and the others are clipped, as `PolicyNetwork` does with the

@@ -134,7 +134,7 @@ MAX_GRAD_NORM = 1.0
 _WARM_CRITIC_RATE = 1e-3  # learning rate of the critic throughout after a warm start, where the actor's is small
 
 
-class RelativeRollouts(RolloutBuffer):
+class _RelativeRollouts(RolloutBuffer):
     """A rollout buffer of advantages relative to the cost to go."""
 
     def __init__(self, *args: Any, living: Callable[[float], float], **kwargs: Any):
@@ -153,7 +153,7 @@ def _mean(network: PolicyNetwork, observation: torch.Tensor) -> torch.Tensor:
     return network(observation) if network.spec.squash == "tanh" else network.raw(observation)
 
 
-class Branches(MlpExtractor):
+class _Branches(MlpExtractor):
     """Actor and critic as SB3's networks, whose outputs are mean actions and values."""
 
     latent_dim_pi, latent_dim_vf = 2, 1
@@ -172,7 +172,7 @@ class Branches(MlpExtractor):
         return self.critic(features)
 
 
-class BranchedPolicy(ActorCriticPolicy):
+class _BranchedPolicy(ActorCriticPolicy):
     """SB3's policy around an actor that respects a symmetry and a critic that sees products."""
 
     def __init__(self, *args: Any, spec: PolicySpec, **kwargs: Any):
@@ -181,11 +181,11 @@ class BranchedPolicy(ActorCriticPolicy):
         super().__init__(*args, **kwargs)
 
     @property
-    def branches(self) -> Branches:
-        return cast(Branches, self.mlp_extractor)
+    def branches(self) -> _Branches:
+        return cast(_Branches, self.mlp_extractor)
 
     def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = Branches(self._spec)
+        self.mlp_extractor = _Branches(self._spec)
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)  # initializes all layers as if they were inner ones; the branches hold the last too
@@ -231,7 +231,7 @@ class Ppo(ModelFree):
         super().__init__(task, params, config, given, warm, backwards=config.backwards, **world)
         self.config = config
         model = PPO(
-            BranchedPolicy,
+            _BranchedPolicy,
             self._env,
             learning_rate=lambda _: self._learning_rate,
             n_steps=config.num_steps,
@@ -242,12 +242,12 @@ class Ppo(ModelFree):
             clip_range=CLIP_RANGE,
             max_grad_norm=MAX_GRAD_NORM,
             policy_kwargs={"spec": spec},
-            rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
+            rollout_buffer_class=_RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs={"living": self._value_of_living} if config.relative_advantages else None,
             seed=seed,
             device="cpu",
         )
-        policy = cast(BranchedPolicy, model.policy)
+        policy = cast(_BranchedPolicy, model.policy)
         self._log_std = cast(torch.nn.Parameter, policy.log_std)
         self._log_std.requires_grad_(False)
         if config.relative_values:  # the critic's last layer, which the policy has as an identity

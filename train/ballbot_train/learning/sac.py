@@ -128,7 +128,7 @@ ENT_COEF = 0.01  # entropy coefficient at the start, in scaled rewards per nat
 _IMITATION_WEIGHT = 300.0
 
 
-class SymmetricReplay(NStepReplayBuffer):
+class _SymmetricReplay(NStepReplayBuffer):
     """A replay buffer that draws half of its samples from demonstrations, if there are any, and shows mirror images."""
 
     def __init__(self, *args: Any, demos: Demos | None, reward_scale: float, mirrors: Mirrors = (), **kwargs: Any):
@@ -193,7 +193,7 @@ def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
     return replace(demos, observations=observations, next_observations=next_observations, **turned)
 
 
-class OwnActor(Actor):
+class _OwnActor(Actor):
     """SB3's actor as a policy network, whose mean actions may be centred."""
 
     def __init__(self, *args: Any, network: PolicyNetwork, **kwargs: Any):
@@ -207,7 +207,7 @@ class OwnActor(Actor):
         return self.network.centred(output, cast(torch.Tensor, obs).unbind(-1)), log_std, more
 
 
-class OwnPolicy(SACPolicy):
+class _OwnPolicy(SACPolicy):
     """SB3's policy with a policy network as its actor, and critics of another network."""
 
     def __init__(self, *args: Any, actor: Callable[..., Actor], products: bool, layer_norm: bool, **kwargs: Any):
@@ -238,7 +238,7 @@ class OwnPolicy(SACPolicy):
         return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, self.activation_fn, post_linear_modules=after))
 
 
-def last_bias(critic: torch.nn.Module) -> torch.Tensor:
+def _last_bias(critic: torch.nn.Module) -> torch.Tensor:
     """The bias of a critic's output."""
     last = critic.linear if isinstance(critic, QuadraticCritic) else cast(torch.nn.Sequential, critic)[-1]
     return cast(torch.nn.Linear, last).bias
@@ -275,7 +275,7 @@ class Sac(ModelFree):
         self.config, self._imitation_weight = config, _IMITATION_WEIGHT
         network = PolicyNetwork(spec)
         model = SAC(
-            OwnPolicy,
+            _OwnPolicy,
             self._env,
             learning_rate=lambda _: self._learning_rate,
             buffer_size=config.buffer_size,
@@ -284,7 +284,7 @@ class Sac(ModelFree):
             tau=TAU,
             gamma=self._gamma,
             gradient_steps=config.gradient_steps,
-            replay_buffer_class=SymmetricReplay,
+            replay_buffer_class=_SymmetricReplay,
             replay_buffer_kwargs={
                 "demos": given,
                 "reward_scale": self._reward_scale,
@@ -297,7 +297,7 @@ class Sac(ModelFree):
             policy_kwargs={
                 "net_arch": list(config.hidden),
                 "activation_fn": torch.nn.SiLU,
-                "actor": partial(OwnActor, network=network),
+                "actor": partial(_OwnActor, network=network),
                 "products": config.products,
                 "layer_norm": warm,
             },
@@ -306,7 +306,7 @@ class Sac(ModelFree):
         )
         # with an entropy coefficient that is tuned, SB3 makes both
         self._log_ent_coef = cast(torch.Tensor, model.log_ent_coef)
-        self._replay = cast(SymmetricReplay, model.replay_buffer)
+        self._replay = cast(_SymmetricReplay, model.replay_buffer)
         actor, log_std = model.actor, cast(torch.nn.Linear, model.actor.log_std)
         torch.nn.init.zeros_(log_std.weight)
         torch.nn.init.constant_(log_std.bias, math.log(config.std))
@@ -323,7 +323,7 @@ class Sac(ModelFree):
             start,
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
             self._replay,
-            [last_bias(critic) for critic in (*model.critic.q_networks, *model.critic_target.q_networks)],
+            [_last_bias(critic) for critic in (*model.critic.q_networks, *model.critic_target.q_networks)],
         )
 
     def _act(self, seen: torch.Tensor) -> torch.Tensor:

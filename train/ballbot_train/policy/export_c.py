@@ -72,13 +72,13 @@ def export_c(
     if not re.fullmatch("[a-z][a-z0-9_]{0,30}", prefix):
         raise ValueError(f"prefix must be small letters, digits and underscores, as left_leg, not {prefix!r:.100}")
     if policy == LQR:
-        network, about = lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
+        network, about = _lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
     else:
         network, about = load_network(policy, task, robot).eval(), metadata(policy, task, robot)
     return files.write(path, _source(network, about, task, robot, filtered, prefix))
 
 
-def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
+def _lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
     """LQR about the equilibrium in which a task ends, as a policy of one layer.
 
     Raises:

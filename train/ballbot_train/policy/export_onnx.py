@@ -75,7 +75,7 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
         "task": task.id,
         "problem": task.problem(),
         "robot": robot,
-        "observation": observation_table(task) + _HEADING * bool(params.OUTPUTS),
+        "observation": _observation_table(task) + _HEADING * bool(params.OUTPUTS),
         "observation_scale": json.dumps(task.observation_scale),
         "history": str(described.get("spec", {}).get("history", 0)),
         "observation_version": str(OBSERVATION_VERSION),
@@ -89,7 +89,7 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
     }
 
 
-def observation_table(task: Task) -> str:
+def _observation_table(task: Task) -> str:
     """The part of a task's docstring that lists its observation: number, quantity, divisor and unit, as a table."""
     _, _, after = (inspect.getdoc(type(task)) or "").partition("Observation, ")
     return "".join(after.partition("\n\nAction")[0])

@@ -33,7 +33,7 @@ _MARK = "ballbot_observation_digest"
 _DATA_LIMIT = 2**24  # bytes of JSON
 
 
-class Saved(NamedTuple):
+class _Saved(NamedTuple):
     """What is read of a model."""
 
     layers: list[Any]
@@ -52,7 +52,7 @@ class Saved(NamedTuple):
         return self.layers[0][0].shape[1]
 
 
-class SavedActor(torch.nn.Module):
+class _SavedActor(torch.nn.Module):
     """Runs a network, and brings its output into [−1, 1]."""
 
     def __init__(self, network: torch.nn.Module, squashed: bool, history: int = 0):
@@ -148,7 +148,7 @@ def fits(path: str | Path, task: Task, params: Robot) -> bool:
     return True
 
 
-def load_actor(path: str | Path, task: Task, params: Robot) -> SavedActor:
+def load_actor(path: str | Path, task: Task, params: Robot) -> _SavedActor:
     """The deterministic policy of a saved model: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
 
     Args:
@@ -169,16 +169,16 @@ def load_actor(path: str | Path, task: Task, params: Robot) -> SavedActor:
     network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
     for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-    return SavedActor(network, model.squashed, history_of(model, task, params)).eval()
+    return _SavedActor(network, model.squashed, history_of(model, task, params)).eval()
 
 
-def _size(model: Saved, task: Task, params: Robot) -> int:
+def _size(model: _Saved, task: Task, params: Robot) -> int:
     """Numbers that an env shows to a model, with the history that the model was trained with."""
     (size,) = observation_space(task, params, history_of(model, task, params)).shape
     return size
 
 
-def read(path: str | Path) -> Saved:
+def read(path: str | Path) -> _Saved:
     """What a file holds; raises a PolicyError as `load_actor`."""
     try:
         return _read_zip(Path(path))
@@ -189,7 +189,7 @@ def read(path: str | Path) -> Saved:
         raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {reason}") from error
 
 
-def _read_zip(path: Path) -> Saved:
+def _read_zip(path: Path) -> _Saved:
     members = files.unzipped(files.read(path), path)
     for name in ("data", "policy.pth"):
         if name not in members:
@@ -218,7 +218,7 @@ def _read_zip(path: Path) -> Saved:
             "and give it to ballbot_train.evaluate"
         )
     found = (_space(data[name]) for name in ("observation_space", "action_space"))
-    return Saved(_layers(path, weights, *begins), activation, usual == "ReLU", *found)
+    return _Saved(_layers(path, weights, *begins), activation, usual == "ReLU", *found)
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:

@@ -37,7 +37,7 @@ LARGEST = 2_000_000
 
 
 @dataclass(frozen=True)
-class Scenario:
+class _Scenario:
     """What the robots of the page are up to."""
 
     title: str
@@ -51,32 +51,32 @@ class Scenario:
 
 
 SCENARIOS = (
-    Scenario(
+    _Scenario(
         "Push",
         "Both robots stand still and get the same push of 90 N·s. LQR is right for small leans only, and falls. "
         "The learned policy leans 45°, brakes and comes back.",
         "stabilize",
         push=(0.6, 90.0, 0.5),  # as `ballbot play` begins
     ),
-    Scenario(
+    _Scenario(
         "Throw",
         "All start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.",
         "stabilize",
         (7, 0, 3, 5),
     ),
-    Scenario(
+    _Scenario(
         "Orbit",
         "From rest onto a circle at 5.5 m/s, which takes a steady lean of 43°.",
         "orbit",
         (17, 1, 2, 3),
     ),
-    Scenario(
+    _Scenario(
         "Turn",
         "A right-angled turn through the gate at 6.8 m/s, with as little force as possible.",
         "turn",
         (1, 2, 3, 5),
     ),
-    Scenario(
+    _Scenario(
         "Weave",
         "Round five obstacles, and to rest behind them. LQR does not know of obstacles.",
         "weave",
@@ -154,7 +154,7 @@ def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
     }
 
 
-def _scenario_data(scenario: Scenario, episode: int | None, params: Robot) -> dict[str, Any]:
+def _scenario_data(scenario: _Scenario, episode: int | None, params: Robot) -> dict[str, Any]:
     task = make_task(scenario.task)
     state, constants, optimum, best = np.zeros(8), np.zeros(0), None, None
     if episode is not None:

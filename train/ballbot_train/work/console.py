@@ -50,7 +50,7 @@ def printable(text: str) -> str:
     )
 
 
-def markdown_text(text: str) -> str:
+def _markdown_text(text: str) -> str:
     """Text as Markdown shows it in a table or a line: no markup, link, HTML or expression of MDX."""
     return printable(text.translate(_MARKDOWN)).replace("](", "]&#40;")
 
@@ -88,7 +88,7 @@ def _speed(task: Task) -> str:
     return f"{task.speed:.3g}/s" if task.speed else ""
 
 
-class LineProgress(Progress):
+class _LineProgress(Progress):
     """Progress for a file or a pipe, which cannot show a bar: every now and then a line per bar that is not full."""
 
     def start(self) -> None:
@@ -136,7 +136,7 @@ def progress_bar() -> Progress:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    return (Progress if console.is_terminal else LineProgress)(*columns, console=console)
+    return (Progress if console.is_terminal else _LineProgress)(*columns, console=console)
 
 
 @contextmanager
@@ -186,7 +186,7 @@ def print_rows(title: str, rows: Sequence[Mapping[str, str]]) -> None:
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The same as a Markdown table; cells are text."""
     lines = [header, ["---"] * len(header), *rows]
-    return "".join(f"| {' | '.join(map(markdown_text, line))} |\n" for line in lines)
+    return "".join(f"| {' | '.join(map(_markdown_text, line))} |\n" for line in lines)
 
 
 def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
