@@ -153,6 +153,8 @@ def _on_fresh(
 ) -> "FreshResult":
     from ballbot_train.evaluation.fresh import evaluate_fresh  # it imports torch
 
+    if filter and not isinstance(policy, str | Path):
+        raise ValueError("on fresh episodes a filter needs a policy by name or file; give one, or leave out filter")
     policy = behind(str(policy), filter) if filter else policy
     robot = robot if isinstance(robot, str) else robot_name(robot)
     return evaluate_fresh(policy, task, count, name=name, robot=robot, randomization=randomization)
