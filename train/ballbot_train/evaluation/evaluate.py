@@ -102,15 +102,11 @@ def evaluate(
         PlanError: an episode has no optimum that can be found.
     """
     if fresh is not None:
-        from ballbot_train.evaluation.fresh import evaluate_fresh  # it imports torch
-
         if out is not None or physics not in (None, "rk4"):
             raise ValueError(
                 "fresh episodes run in the batched closed-form model, and write no folder; leave out physics and out"
             )
-        named_robot = robot if isinstance(robot, str) else robot_name(robot)
-        policy = behind(str(policy), filter) if filter else policy
-        return evaluate_fresh(policy, task, fresh, name=name, robot=named_robot, randomization=randomization)
+        return _on_fresh(policy, task, fresh, name, randomization, robot, filter)
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = range(checked_episodes(episodes))
@@ -142,6 +138,24 @@ def evaluate(
         return row
     finally:
         env.close()
+
+
+def _on_fresh(
+    policy: Any,
+    task: str | Task,
+    count: int,
+    name: str | None,
+    randomization: Randomization | str | None,
+    robot: str | BallbotParams,
+    filter: str | None,
+) -> "FreshResult":
+    from ballbot_train.evaluation.fresh import evaluate_fresh  # it imports torch
+
+    if filter and not isinstance(policy, str | Path):
+        raise ValueError("on fresh episodes a filter needs a policy by name or file; give one, or leave out filter")
+    policy = behind(str(policy), filter) if filter else policy
+    robot = robot if isinstance(robot, str) else robot_name(robot)
+    return evaluate_fresh(policy, task, count, name=name, robot=robot, randomization=randomization)
 
 
 @dataclass(frozen=True)
