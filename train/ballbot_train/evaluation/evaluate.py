@@ -146,7 +146,7 @@ def _on_fresh(
     count: int,
     name: str | None,
     randomization: Randomization | str | None,
-    robot: str | BallbotParams,
+    robot: str | Robot,
     filter: str | None,
 ) -> "FreshResult":
     from ballbot_train.evaluation.fresh import evaluate_fresh  # it imports torch
