@@ -149,7 +149,9 @@ def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:
     """
     lengths = arrays["lengths"]
     n, ends = int(lengths.sum()), np.cumsum(lengths + 1) - 1  # where the observations of each episode end
-    shapes = {"observations": (n + len(lengths), observations), "labels": (n, 2), "actions": (n, 2), "rewards": (n,)}
+    size = np.shape(arrays["actions"])[1:]  # of an action
+    shapes = {"observations": (n + len(lengths), observations), "labels": (n, *size), "actions": (n, *size)}
+    shapes["rewards"] = (n,)
     found = {
         name: files.numbers(arrays[name], name, shape, LARGEST).astype(np.float32) for name, shape in shapes.items()
     }

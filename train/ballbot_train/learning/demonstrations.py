@@ -189,7 +189,7 @@ def record(
             expert.replan(t, info["state"])
         label = expert.label(t, info["state"])
         pushed = rng.random() < pushes * dt
-        disturbed = rng.uniform(-1, 1, 2) if pushed else label + std * rng.standard_normal(2)
+        disturbed = rng.uniform(-1, 1, len(label)) if pushed else label + std * rng.standard_normal(len(label))
         action = np.clip(disturbed, -1, 1).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated

@@ -41,8 +41,6 @@ class Algorithm:
     """Whether it trains policies that see earlier observations and actions."""
     informed: bool = False
     """Whether it trains policies that are given each robot's parameters, and run behind a filter."""
-    wheels: bool = False
-    """Whether it trains robots with wheels."""
     clock: bool = False
     """Whether it trains tasks whose cost and goal depend on the time."""
 
@@ -82,7 +80,6 @@ class Algorithm:
             "tracks": randomization is not None,
             "history": history > 0,
             "informed": informed,
-            "wheels": bool(params.OUTPUTS),
             "clock": task.clock,
         }
         for ability in (name for name, is_wanted in wanted.items() if is_wanted and not getattr(self, name)):
@@ -140,7 +137,6 @@ _WORDS = {
     "tracks": "tracks (--randomization)",
     "history": "a history (--history)",
     "informed": "informed policies (--informed)",
-    "wheels": "robots with wheels",
     "clock": "tasks whose cost or goal depends on the time",
 }
 """What messages call the abilities of an `Algorithm`."""
@@ -155,7 +151,6 @@ LEARNERS: dict[str, Algorithm] = {
         tracks=True,
         history=True,
         informed=True,
-        wheels=True,
         clock=True,
     ),
     "dagger": Algorithm(
@@ -165,7 +160,6 @@ LEARNERS: dict[str, Algorithm] = {
         start=True,
         tracks=True,
         history=True,
-        wheels=True,
     ),
     "ppo": Algorithm(
         f"{_HERE}.ppo",

@@ -225,7 +225,10 @@ class _OwnPolicy(SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         critic = super().make_critic(features_extractor)
-        inputs, hidden = critic.features_extractor.features_dim + 2, cast(list[int], self.net_arch)
+        inputs, hidden = (
+            critic.features_extractor.features_dim + sum(self.action_space.shape or ()),
+            cast(list[int], self.net_arch),
+        )
         critic.q_networks = [self._critic(inputs, hidden) for _ in critic.q_networks]
         for index, network in enumerate(critic.q_networks):
             critic.add_module(f"qf{index}", network)
