@@ -14,7 +14,7 @@ import ballbot_gym
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
 from ballbot_gym import BallbotBatch, BallbotEnv, BallbotVectorEnv, rollout
 from ballbot_train import evaluate
-from ballbot_train.cli import main
+from ballbot_train.cli import _run as main
 
 FILE = Path(__file__).parent.parent / "examples" / "cart_pole.py"
 
