@@ -16,6 +16,9 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import Randomization, Wheels, named_robot, omni
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
+from ballbot_train import evaluate
+from ballbot_train.evaluation import recordings
+from ballbot_train.evaluation.submissions import SubmissionError, verify
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
@@ -295,11 +298,32 @@ def test_a_free_heading_costs_nothing(robot):
     )
 
 
-def test_what_knows_no_wheels_says_so(robot):
+def test_what_does_not_support_wheels_names_the_property_that_is_missing(robot):
     task = make_task("stabilize", "omni")
     with pytest.raises(ValueError, match="pushes add to an action Fx, Fy, which Omni does not have"):
         BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
-    with pytest.raises(ValueError, match="omni has three wheels, and neither a frame nor mirror images"):
+    with pytest.raises(ValueError, match="omni has no symmetry"):
         PolicySpec.of(task, robot="omni", frame="orbit")
-    with pytest.raises(ValueError, match="sac does not support robots with wheels; train with apg or dagger"):
-        LEARNERS["sac"].make(task, robot, LEARNERS["sac"].settings("stabilize"), 0)
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_model_free_learners_train_wheels(robot, name):
+    settings = dataclasses.replace(LEARNERS[name].settings("stabilize"), num_envs=4, num_steps=2, batch_size=4)
+    learner = LEARNERS[name].make(make_task("stabilize", "omni"), robot, settings, 0)
+    learner.iterate()
+    assert learner.network.spec.actions == 3
+
+
+def test_a_motion_on_wheels_is_verified_from_its_states_and_actions(tmp_path):
+    strong = named_robot("omni_strong")
+    evaluate("lqr", "stabilize", 2, "rk4", robot="omni_strong", out=tmp_path)
+    (path,) = (tmp_path / "recordings").glob("*.npz")
+    held = recordings.read(path)
+    mine = dataclasses.replace(held, about=held.about | {"name": "mine", "link": ""})
+    assert mine.states.shape[1] == strong.state_size
+    row = verify("mine.npz", episodes=2, content=recordings.to_bytes(mine))
+    assert row.success == 1.0
+    turned = mine.states.copy()
+    turned[50, 8] += 1e-4  # the heading of one moment
+    with pytest.raises(SubmissionError, match="step 50"):
+        verify("mine.npz", episodes=2, content=recordings.to_bytes(dataclasses.replace(mine, states=turned)))

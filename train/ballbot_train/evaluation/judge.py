@@ -8,7 +8,7 @@ import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.engines import make_simulator
-from ballbot_gym.robot import Ballbot, Robot, substeps_for
+from ballbot_gym.robot import Robot, substeps_for
 from ballbot_gym.step import limit_names, outcome
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import recordings
@@ -69,7 +69,7 @@ def judged(
     reached, slip = stepped(physics, robot, task, steps.before, force)
     error = steps.after - reached
     missed = np.abs(error)
-    steps.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated))
+    steps.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated, robot))
     steps.refuse(~(slip <= SLIP_TOLERANCE), lambda i: f"the ball slips at {slip[i]:.2g} m/s. {_SLIPS}")
     c = known.constants[steps.episode]
     limits = robot.limits(steps.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
@@ -140,10 +140,10 @@ def stepped(
     return reached, slip
 
 
-def _jump(missed: np.ndarray, tolerance: float, contact: bool) -> str:
+def _jump(missed: np.ndarray, tolerance: float, contact: bool, robot: Robot) -> str:
     """What is wrong with a step whose end is missed by so much."""
     i = int(np.argmax(np.where(np.isfinite(missed), missed, np.inf)))
-    quantity, unit = Ballbot.STATE[i]
+    quantity, unit = robot.STATE[i]
     slips = f". {_SLIPS}" * contact
     missed_by = f"{quantity} is off by {missed[i]:.2g} {unit}, and {tolerance:g} is allowed"
     return f"the next state does not follow: {missed_by}{slips}"
