@@ -11,8 +11,8 @@ import numpy as np
 
 from ballbot_gym import counter_rng, ops
 from ballbot_gym.native import FLAG_ROWS, BallbotNative, Computed, State
-from ballbot_gym.robot import Robot, substeps_for
-from ballbot_gym.step import outcome
+from ballbot_gym.robot import Robot
+from ballbot_gym.step import step
 from ballbot_gym.tasks import Task
 
 _REWARD, _COST, _SURVIVE, _RUNNING, _GOAL = range(5)  # rows of what is paid
@@ -61,24 +61,21 @@ class BallbotArrays(BallbotNative):
         """One control step: rows of states, tilts, forces and grip; pay; flags; and violated limits."""
         task, params, size = self.task, self.params, self.num_envs
         x, c, a = tuple(old.x), tuple(old.c), tuple(actions.T)
-        u = tuple(ops.clip(part, -1.0, 1.0) * params.force_limit for part in a)
-        end = params.step(x, u, task.control_dt, substeps_for(task.control_dt))
-        grip, held = params.held(x, u, task.control_dt)
-        did = outcome(task, x, u, end, c, (old.steps + 1).astype(self.dtype), held)
-        survive = task.survival_reward * task.control_dt
-        reward = survive - did.running + did.goal
+        made = step(task, params, x, c, old.steps.astype(self.dtype), a)
+        did, reward, survive = made.outcome, made.reward, task.survival_reward * task.control_dt
         running = np.where(did.violated >= 0, reward - survive, -did.cost)
         goal = np.where(did.success > 0, reward - survive - running, 0) if task.first_exit else 0.0
         pay = np.empty((5, size))
         for row, part in zip(pay, (reward, did.cost, survive, running, goal), strict=True):
             row[:] = part
-        clipped = np.any([np.abs(part) > 1 for part in a], axis=0)
         flags = np.empty((FLAG_ROWS, size), bool)
-        for row, part in zip(flags, (did.terminated, did.truncated, did.success, did.failure, clipped), strict=False):
+        for row, part in zip(
+            flags, (did.terminated, did.truncated, did.success, did.failure, made.clipped), strict=False
+        ):
             row[:] = np.asarray(part) != 0
         flags[_TRUNCATED] |= ~flags[_TERMINATED] & (old.steps + 1 >= self.most_steps)
         flags[_DONE] = flags[_TERMINATED] | flags[_TRUNCATED]
-        rows = self._rows((*end, *params.measurements(end), *u, *grip), size)
+        rows = self._rows((*made.end, *params.measurements(made.end), *made.force, *made.grip), size)
         return rows, pay, flags, np.asarray(did.violated, np.int64)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:

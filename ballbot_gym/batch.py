@@ -7,9 +7,7 @@ Eager batches give bit-identical results for the same seed and actions, and so d
 and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
 
-import functools
 import logging
-import operator
 import shutil
 import types
 from collections.abc import Sequence
@@ -32,7 +30,7 @@ from ballbot_gym.robot import (
     substeps_for,
 )
 from ballbot_gym.seeding import seeds_of
-from ballbot_gym.step import check_observation, limit_names, outcome
+from ballbot_gym.step import check_observation, limit_names, step
 from ballbot_gym.tasks import Task
 
 with imports_of("a batch of environments", "train"):
@@ -313,28 +311,28 @@ class BallbotBatch:
         now = _rows(state)
         x, c = now.x, now.c
         asked = actions.to(self.dtype).unbind(-1)
-        command = tuple(part.clamp(-1.0, 1.0) * self.params.force_limit for part in asked)
-        force, actuator = noise.actuate(command, now.drawn, now.actuator)
-        total = force
+        z = ()
         if noise.pushes:
-            z = counter_rng.uniforms(
-                counter_rng.key(state.seed, state.episode, state.steps + 1), Randomization.PUSH_DRAWS, self.dtype
-            )
-            total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
-        robot = self.model(now.drawn)
-        end = self._moved(robot, x, total)
-        grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
-        if self.params.grips:
-            with torch.no_grad():  # it decides what ends an episode, and nothing else
-                held, kept = robot.held(x, total, task.control_dt)
-                grip = torch.stack(held)
-        steps = state.steps + 1
-        did = outcome(task, x, force, end, c, steps.to(self.dtype), kept)
+            key = counter_rng.key(state.seed, state.episode, state.steps + 1)
+            z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS, self.dtype)
+        made = step(
+            task,
+            self.params,
+            x,
+            c,
+            state.steps.to(self.dtype),
+            asked,
+            noise,
+            now.drawn,
+            now.actuator,
+            z,
+            self._moved,
+        )
+        end, did, steps = made.end, made.outcome, state.steps + 1
         truncated = did.truncated
         if self.most_steps < task.steps:
             truncated = torch.where(steps >= self.most_steps, 1.0 - did.terminated, truncated)
         done = did.terminated + truncated > 0
-        reward = task.survival_reward * task.control_dt - did.running + did.goal
 
         past = now.past
         if past:
@@ -343,8 +341,8 @@ class BallbotBatch:
         read = now.sensors
         if read:
             z = counter_rng.uniforms(counter_rng.key(state.seed, state.episode, steps), sensors.DRAWS, self.dtype)
-            read = sensors.following(robot, read, x, total, end, z, task.control_dt)
-        after = now._replace(x=end, steps=steps, actuator=actuator, past=past, sensors=read)
+            read = sensors.following(self.model(now.drawn), read, x, made.total, end, z, task.control_dt)
+        after = now._replace(x=end, steps=steps, actuator=made.actuator, past=past, sensors=read)
         new, observed = after, self._observe(after)
         observation = observed
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
@@ -353,7 +351,7 @@ class BallbotBatch:
             observation = self._observe(new)
         result = BatchStep(
             observation=observation,
-            reward=reward,
+            reward=made.reward,
             cost=did.cost,
             terminated=did.terminated,
             truncated=truncated,
@@ -362,22 +360,27 @@ class BallbotBatch:
             success=did.success,
             failure=did.failure,
             violated=did.violated,
-            force=torch.stack(force),
-            clipped=torch.where(functools.reduce(operator.or_, (part.abs() > 1.0 for part in asked)), 1.0, 0.0),
-            grip=grip,
+            force=torch.stack(made.force),
+            clipped=torch.where(made.clipped, 1.0, 0.0),
+            grip=torch.stack(made.grip)
+            if made.grip
+            else torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device),
         )
         return self._stacked(new), result
 
     def _moved(
         self, robot: Any, x: tuple[torch.Tensor, ...], force: tuple[torch.Tensor, ...]
-    ) -> tuple[torch.Tensor, ...]:
-        """The states after a control step."""
+    ) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
+        """The states after a control step, and what the floor does, which carries no gradient."""
         dt, slope = self.task.control_dt, self._slope
         if slope is None:
-            return robot.step(x, force, dt, self._substeps)
-        rows = (torch.stack(x),), (torch.stack(force),)
-        (end,) = robot.step(*rows, dt, self._substeps, lambda x, u: (slope(*x, *u),))
-        return end.unbind(0)
+            end = robot.step(x, force, dt, self._substeps)
+        else:
+            rows = (torch.stack(x),), (torch.stack(force),)
+            (moved,) = robot.step(*rows, dt, self._substeps, lambda x, u: (slope(*x, *u),))
+            end = moved.unbind(0)
+        with torch.no_grad():  # it decides what ends an episode, and nothing else
+            return end, *robot.held(x, force, dt)
 
     def _compiled_slope(self) -> Any:
         """`Robot.derivative` of states (n, B) and forces (m, B), compiled."""

@@ -13,8 +13,8 @@ from typing import Any
 
 from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import Robot, substeps_for
-from ballbot_gym.step import outcome
+from ballbot_gym.robot import Robot
+from ballbot_gym.step import step
 from ballbot_gym.tasks import Task
 
 with imports_of("the machine code of batches", "baselines"):
@@ -175,22 +175,16 @@ def text(name: str) -> str:
 def _advance(
     task: Task, params: Robot, x: tuple, c: tuple, action: tuple, taken: Any
 ) -> tuple[tuple[str, Sequence[Any]], ...]:
-    """One control step, as `BallbotBatch.transition` computes it, up to the start of the next episode."""
-    u = tuple([casadi.fmax(casadi.fmin(part, 1.0), -1.0) * params.force_limit for part in action])
-    end = params.step(x, u, task.control_dt, substeps_for(task.control_dt))
-    grip, kept = params.held(x, u, task.control_dt)
-    did = outcome(task, x, u, end, c, taken + 1, kept)
-    reward = task.survival_reward * task.control_dt - did.running + did.goal
-    clipped = casadi.fabs(action[0]) > 1
-    for part in action[1:]:
-        clipped = casadi.logic_or(clipped, casadi.fabs(part) > 1)
+    """One control step, up to the start of the next episode."""
+    did = step(task, params, x, c, taken, action)
+    end = did.outcome
     return (
-        ("end", end),
-        ("force", u),
-        ("grip", grip),
-        ("pay", (reward, did.cost)),
-        ("flags", (did.terminated, did.truncated, did.success, did.failure, clipped)),
-        ("violated", (did.violated,)),
+        ("end", did.end),
+        ("force", did.force),
+        ("grip", did.grip),
+        ("pay", (did.reward, end.cost)),
+        ("flags", (end.terminated, end.truncated, end.success, end.failure, did.clipped)),
+        ("violated", (end.violated,)),
     )
 
 

@@ -4,6 +4,7 @@ It computes with `ops`, so with floats, torch, CasADi and `traced` alike. Truth 
 these are the same everywhere.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from gymnasium import spaces
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.robot import Randomization, Robot
+from ballbot_gym.robot import Randomization, Robot, substeps_for
 from ballbot_gym.tasks.base import Task
 
 _LARGEST_OBSERVED = 1e6  # far beyond what any episode shows
@@ -84,8 +85,85 @@ def outcome(
     )
 
 
+class Step(NamedTuple):
+    """One control step of a robot, as far as it does not start another episode."""
+
+    end: tuple[Any, ...]
+    """The state after it."""
+    force: tuple[Any, ...]
+    """What the actuators apply, as `Robot.ACTION` names it."""
+    total: tuple[Any, ...]
+    """The same with pushes."""
+    actuator: tuple[Any, ...]
+    """What the actuators remember."""
+    clipped: Any
+    """Whether a component of the action was outside [−1, 1]."""
+    grip: tuple[Any, ...]
+    """What `info` reports as "grip"; () of a robot that cannot lose its grip."""
+    reward: Any
+    outcome: Outcome
+
+
+Move = Callable[[Any, tuple[Any, ...], tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]]
+"""Robot, state and what is applied -> the state after a control step, and what `Robot.held` gives."""
+
+
+def closed_form(dt: float) -> Move:
+    """How a robot moves over control steps of dt, s, by its equations of motion."""
+    substeps = substeps_for(dt)
+
+    def move(robot: Any, x: tuple[Any, ...], u: tuple[Any, ...]) -> tuple[tuple[Any, ...], ...]:
+        return robot.step(x, u, dt, substeps), *robot.held(x, u, dt)
+
+    return move  # pyright: ignore[reportReturnType]
+
+
+def step(
+    task: Task,
+    robot: Any,
+    x: tuple[Any, ...],
+    c: tuple[Any, ...],
+    taken: Any,
+    action: tuple[Any, ...],
+    variation: Randomization = Randomization(),
+    drawn: tuple[Any, ...] = (),
+    actuator: tuple[Any, ...] = (),
+    z: tuple[Any, ...] = (),
+    move: Move | None = None,
+) -> Step:
+    """One control step: what the actuators apply, where it takes the robot, and what it costs, pays and ends.
+
+    A pure function over `ops`: of floats, of NumPy arrays or torch tensors (B,), and of symbols from which C is printed.
+
+    Args:
+        task, robot: the problem, with the nominal robot.
+        x, c: the state, and the constants of the episode, without the time.
+        taken: control steps of the episode before this one.
+        action: in units of the robot's force limit; clipped to [−1, 1].
+        variation: what varies, and what it drew for the episode.
+        actuator: what the actuators remember.
+        z: uniform numbers for a push; () where none comes.
+        move: how the robot moves; default, the closed form.
+    """
+    commanded = tuple([ops.clip(part, -1.0, 1.0) * robot.force_limit for part in action])
+    force, actuator = variation.actuate(commanded, drawn, actuator)
+    total = force
+    if z:
+        total = tuple([f + push for f, push in zip(force, variation.push(z, task.control_dt), strict=True)])
+    model = variation.robot(robot, drawn) if variation.varies_robot else robot
+    end, grip, kept = (move or closed_form(task.control_dt))(model, x, total)
+    did = outcome(task, x, force, end, c, taken + 1, kept)
+    largest = action[0] * action[0]
+    for part in action[1:]:
+        largest = ops.maximum(largest, part * part)
+    reward = task.survival_reward * task.control_dt - did.running + did.goal
+    return Step(end, force, total, actuator, largest > 1.0, grip, reward, did)
+
+
 def first_violated(limits: tuple[Any, ...]) -> Any:
-    """Index of the first limit that is not ≥ 0, so of NaN too; −1 where all are."""
+    """Index of the first limit that is not ≥ 0, so of NaN too; −1 where all are, or where there is none."""
+    if not limits:
+        return -1.0
     violated = ops.full_like(limits[0], -1.0)
     for i in reversed(range(len(limits))):
         violated = ops.where(limits[i] >= 0, violated, float(i))
