@@ -47,9 +47,6 @@ from ballbot_gym.robot.urdf import (
     urdf_text,
 )
 
-BallbotParams = Ballbot
-"""The name of the class in version 0.1."""
-
 __all__ = [
     "LEAST_NORMAL_FORCE",
     "OMNI_URDF_PATH",
@@ -62,7 +59,6 @@ __all__ = [
     "URDF_FOLDER",
     "URDF_PATH",
     "Ballbot",
-    "BallbotParams",
     "Cylinder",
     "Kind",
     "Omni",
