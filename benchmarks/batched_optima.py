@@ -1,4 +1,4 @@
-"""Optima per second of `find_optima`, many episodes at once, beside `find_optimum`, on fresh episodes of every task.
+"""Optima per second of `find_optima`, many episodes at once, compared with `find_optimum`, on fresh episodes of each task.
 
 Times are of the processor, of one process, so that a busy machine spoils them less. Run it with OMP_NUM_THREADS=1. Both solve
 the same episodes in turns, some at a time. Compiling is left out.

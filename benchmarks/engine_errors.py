@@ -102,7 +102,7 @@ class DrakeContactSimulator(Simulator):
     """A robot whose ball rolls in Drake, with point contact: a chain of joints like MuJoCo's."""
 
     def __init__(self, params: Robot, control_dt: float, physics_dt: float | None = None):
-        """Args: as of the engines; physics_dt is 1 ms by default."""
+        """Args: same as for the engines; physics_dt is 1 ms by default."""
         from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
         from pydrake.math import RigidTransform, RotationMatrix
         from pydrake.multibody import plant as drake

@@ -129,7 +129,7 @@ class Process:
         self.status: int | None = None
 
     def wait(self, seconds: float) -> int | None:
-        """Its exit status, or None if it still runs after so many seconds."""
+        """Its exit status, or None if it still runs after `seconds`."""
         end = time.monotonic() + seconds
         while self.running() and time.monotonic() < end:
             time.sleep(0.02)
@@ -174,7 +174,7 @@ class Trial:
         self.out = folder / "out-v0"
 
     def start(self, out: Path | None = None, file_bytes: int | None = None, fork: bool = True) -> Process:
-        """Starts the command, perhaps on a disk where a file can hold so many bytes only.
+        """Starts the command, perhaps on a disk where a file can hold only `file_bytes` bytes.
 
         Args:
             out: its folder.
@@ -253,7 +253,7 @@ class Trial:
         self.clear()
 
     def killed(self) -> None:
-        """Kills at random moments: the command alone, or it and its workers. Where it ends before, it starts anew."""
+        """Kills at random moments: the command alone, or it and its workers. If it ends before, it is started again."""
         seconds = 0.0  # that it takes undisturbed
         while self.kills < self.wanted_kills:
             start, process = time.monotonic(), self.start()

@@ -80,7 +80,7 @@ def mutated(rng: random.Random, content: bytes) -> bytes:
 
 
 def repacked(rng: random.Random, content: bytes, change: bool) -> bytes:
-    """A zip archive packed anew, perhaps with a mutated member. Its checksums are right: readers get to see the member."""
+    """A zip archive packed again, perhaps with a mutated member. Its checksums are right, so readers reach the member."""
     packed = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as archive, zipfile.ZipFile(packed, "w") as copy:
         members = archive.infolist()

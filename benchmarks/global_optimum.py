@@ -1,4 +1,4 @@
-"""Planar episodes of Stabilize by dynamic programming, which knows no local optima, beside `find_optimum`.
+"""Planar episodes of Stabilize by dynamic programming, which has no local optima, compared with `find_optimum`.
 
 In a vertical plane the robot has four states and one force. The cost-to-go is computed on a grid of states by policy
 iteration: each node holds the best force known, and the ratio of the cost-to-go to LQR's, which is 1 at rest. A sweep tries
@@ -139,7 +139,7 @@ class Grid:
 
     def iterate(self, sweeps: int, report: Callable[[int, float], None]) -> None:
         """Sweeps over all nodes; `report` gets the number of sweeps and the mean change of the last."""
-        spread = 60.0  # N, between the forces that are tried beside the best so far
+        spread = 60.0  # N, between the best force so far and the others that are tried
         with ThreadPoolExecutor(_THREADS) as threads:
             parts = np.array_split(np.arange(len(self._u)), max(8 * _THREADS, len(self._u) // 10_000))
             for k in range(sweeps):
@@ -214,7 +214,7 @@ def main(
     optima = [find_optimum(TASK, PARAMS, x0, np.zeros(0)) for x0 in tested]
     aside = np.array([np.abs(optimum.trajectory.x[:, 1]).max() for optimum in optima])
     cost = np.array([optimum.cost for optimum in optima])
-    flat = aside < 1e-6  # where leaving the plane pays, the plane's optimum is dearer
+    flat = aside < 1e-6  # where leaving the plane pays, the plane's optimum costs more
     values, grid = [], Grid(axes, sizes[0])
     for n in sizes:
         began = time.perf_counter()

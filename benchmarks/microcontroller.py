@@ -197,7 +197,7 @@ def _measured(task: str, robot: str, name: str, folder: Path) -> Row:
 
 
 class _Recorded:
-    """A controller, of which all is kept that it was shown, in float32, and what it did."""
+    """A controller whose inputs, in float32, and forces are recorded."""
 
     def __init__(self, controller: Controller, filtered: bool):
         self._controller, self.senses = controller, filtered

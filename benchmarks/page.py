@@ -1,8 +1,8 @@
 """One page with all figures of speed: `make bench`. It runs the benchmarks below, one after another.
 
-Each figure stands beside its ratio to that of the last page of another commit. A benchmark during which other processes took
-more than 5 % of the cores is marked as busy. What is done is not done again for the same commit, so an interrupted page
-goes on where it was; with changes that are not committed everything is measured anew.
+Each figure is followed by its ratio to that of the last page of another commit. A benchmark during which other processes took
+more than 5 % of the cores is marked as busy. Finished benchmarks are not repeated for the same commit, so an interrupted page
+continues where it was. With uncommitted changes everything is measured again.
 """
 
 import csv
@@ -42,7 +42,7 @@ class Section:
     """Columns with figures, and their units."""
     arguments: tuple[str, ...] = ()
     quick: tuple[str, ...] = ()
-    """In place of `arguments` for a quick page."""
+    """Replaces `arguments` for a quick page."""
     table: str = ""
     """Name of the CSV file, if it is not that of the script."""
 
@@ -100,7 +100,7 @@ SECTIONS = (
 def main(
     out: Path = Path("runs/bench"), sections: tuple[str, ...] = (), quick: bool = False, previous: Path | None = None
 ) -> None:
-    """Runs the benchmarks, and writes bench.md, with figures beside it.
+    """Runs the benchmarks, and writes bench.md and its figures.
 
     Args:
         out: folder of the pages, one folder for each commit.
@@ -173,9 +173,9 @@ def _short(text: str) -> str:
 
 
 def _processor_seconds() -> tuple[float, float]:
-    """Seconds in which cores worked, for whomever, and those of them for the processes that this one waited for.
+    """Seconds in which cores worked for any process, and seconds in which they worked for the children of this process.
 
-    Without /proc there is no first; then both are the same, and nobody seems busy.
+    Without /proc the first is not known. Then both are the same, and no benchmark is marked as busy.
     """
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     own = usage.ru_utime + usage.ru_stime

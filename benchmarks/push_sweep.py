@@ -1,4 +1,4 @@
-"""The hardest push from which the robot recovers: LQR, trajectory optimization re-planned from the push, and NMPC.
+"""The hardest push that the robot recovers from: LQR, trajectory optimization re-planned from the push, and NMPC.
 
 At rest, the body is hit at its centre of mass by a horizontal impulse. LQR and NMPC meet it unprepared: NMPC planned to stand
 still. Re-planning knows the pushed state and takes the time it takes.

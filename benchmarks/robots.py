@@ -47,7 +47,7 @@ def main(
     """Measures, and writes robots.csv.
 
     Args:
-        robots: names; the paper's is measured beside them.
+        robots: names; the paper's is measured too.
         tasks: names.
         count: envs of the batch.
         seconds: of each run of the batch.

@@ -7,7 +7,7 @@
 |---|---|
 | overhead | time from item to item less that in the item, here and on one node: items of 1 ms to 1 s, in jobs of 1 and 5 |
 | throughput | items a second with 1, 2 and 4 workers: items that compute, and items that sleep |
-| driver | CPU time of this process per item, and the items a second that it takes: entries of 40 kB, as of an optimum |
+| driver | CPU time of this process per item, and the items a second that it takes: entries of 40 kB, the size of an optimum |
 | kill | two Ray nodes on this machine, one killed after a quarter of the items: all arrive once, as one process makes them |
 
 Items that sleep measure the executor alone, also on a machine with few cores or much else to do.

@@ -1,8 +1,9 @@
-"""Lower bounds of what each choice of sides in a slalom costs, beside the costs themselves and what `sides.predict` says.
+"""Lower bounds of the cost of each choice of sides in a slalom, with the costs themselves and those of `sides.predict`.
 
 An episode that passes all obstacles on given sides also passes one or two of them on theirs. So the optimum without the
-other obstacles costs no more: the dearest of these relaxed problems bounds the choice from below. A choice is pruned if its
-bound is above the best cost found. The bounds are as global as the optima of the relaxed problems, which have few obstacles.
+other obstacles costs no more. The highest optimum of these relaxed problems is a lower bound for the choice. A choice is
+pruned if its bound is above the best cost found. The bounds are as global as the optima of the relaxed problems, which have
+few obstacles.
 
 Every choice is solved from its own path. It writes side_bounds.csv with a line for each choice of each episode.
 """

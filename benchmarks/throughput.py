@@ -26,7 +26,7 @@ from ballbot_gym.engines.mujoco import import_mujoco
 
 _TURNS = 41  # in which raw loop and env are compared
 _GAIN = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1.3]])
-_UPRIGHT = 1  # seed of a start from which this gain brings the robot to rest
+_UPRIGHT = 1  # seed of a start that this gain brings to rest
 
 
 @dataclass
@@ -245,7 +245,7 @@ def mujoco(name: str, count: int, seconds: float) -> Row:
 
 
 def _timed(row: Row, step: Callable[[], object], seconds: float, steps: int = 1) -> Row:
-    """The row with the speed of step, which takes so many control steps."""
+    """The row with the speed of step. One call takes `steps` control steps."""
     start = time.perf_counter()
     step()
     row.first_step_seconds = time.perf_counter() - start

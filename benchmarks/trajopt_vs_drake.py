@@ -50,7 +50,7 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
 
     Args:
         out: folder of trajopt_vs_drake.csv and .png.
-        repeats: solves of which the median is taken.
+        repeats: number of solves; their median is taken.
         quick: two problems, one solve each.
     """
     params, rows = default_params(), []

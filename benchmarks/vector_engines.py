@@ -30,7 +30,7 @@ def main(
     Args:
         task: name of the task.
         sizes: numbers of envs.
-        runs: of which the median is taken.
+        runs: number of runs; their median is taken.
         seconds: of each run.
         out: folder of the result.
     """

@@ -31,7 +31,7 @@ def result(**changes):
 
 def stress_result(stress, level, **changes):
     """The same under a disturbance."""
-    return result(told={"stress": stress, "level": level}, **changes)
+    return result(labels={"stress": stress, "level": level}, **changes)
 
 
 def measured(cost_ratio, cost, mean_cost, success=1.0):

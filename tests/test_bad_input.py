@@ -405,7 +405,7 @@ DEMOS = [
     (dataset(), 'is no dataset of "ballbot demos"'),
     (dataset("[" * 100_000), "nested too deeply"),
     (dataset('{"demos": 3}'), "not made by ballbot demos"),
-    (dataset(json.dumps(DESCRIBED)), 'is damaged; make it anew with "ballbot demos"'),
+    (dataset(json.dumps(DESCRIBED)), 'is damaged; record it again with "ballbot demos"'),
     (lambda f: DemoConfig(episodes=0), "episodes must be 1 to 1000000, not 0"),
     (lambda f: DemoConfig(noise=math.nan), "noise must be finite and at least 0"),
     (lambda f: DemoConfig(expert="me"), "unknown expert me; known: lqr"),

@@ -71,7 +71,7 @@ def cells_and_results(bounds, recovered):
     """All cells of all maps of 5 points, and results of LQR in which it recovers from some, (axis, i, j)."""
     cells = {name: np.argwhere(np.ones((POINTS, POINTS))) for name in bounds}
     results = [
-        certified_result(controller="lqr", episode=k, success=(name, i, j) in recovered, told={"axis": name})
+        certified_result(controller="lqr", episode=k, success=(name, i, j) in recovered, labels={"axis": name})
         for name in bounds
         for k, (i, j) in enumerate(cells[name].tolist())
     ]

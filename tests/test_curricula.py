@@ -169,7 +169,7 @@ def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypat
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("stabilize", {"backwards": True}, "BallbotStabilize-v0 cannot be learnt backwards"),
+        ("stabilize", {"backwards": True}, "BallbotStabilize-v0 cannot be learned backwards"),
         ("turn", {"short_episodes": (0.5, 0.6)}, "BallbotTurn-v0 pays at its goal"),
         ("weave", {"short_episodes": (1.5, 0.6)}, "short_episodes must be a share of 0 to 1"),
     ],

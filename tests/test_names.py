@@ -188,7 +188,7 @@ def test_a_shipped_policy_is_called_by_the_whole_way_of_its_training() -> None:
     shown = {"task": lambda row: row.task, "controller": lambda row: row.controller}
     cells = [controller for _, controller in table_cells(shown, rows, ways)]
     assert cells == ["dagger → shac → ppo", "dagger → shac-late", "lqr", "ppo.json", "ppo"]
-    made = Row("turn", "ppo", told={"made_for": "rolling", "robot": "paper"})
+    made = Row("turn", "ppo", labels={"made_for": "rolling", "robot": "paper"})
     assert table_cells(shown, [made], ways) == [["turn", "ppo"]]
     assert labels(["ppo", "lqr"], {"ppo": "dagger → shac → ppo"}) == {"ppo": "DAgger → SHAC → PPO", "lqr": "LQR"}
 

@@ -31,7 +31,7 @@ def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     results = run("delay", 3, tmp_path)
     plain = runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 3, tmp_path / "plain", 1)
     rows = leaderboard(results)
-    assert [tuple(row.told.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
+    assert [tuple(row.labels.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean
     costs = [row.cost_mean for row in rows]
     assert costs[0] == min(costs)
@@ -53,12 +53,12 @@ def test_files_hold_the_rows_and_the_figure_is_drawn(tmp_path):
     rows = leaderboard(results)
     write_results("robustness", rows, results, {"commit": "none"}, tmp_path)
     document = json.loads((tmp_path / "robustness.json").read_text())
-    assert [(row["stress"], row["level"]) for row in document["rows"]] == [tuple(r.told.values()) for r in results]
+    assert [(row["stress"], row["level"]) for row in document["rows"]] == [tuple(r.labels.values()) for r in results]
     assert document["rows"][2]["regret_mean"] is None
     with (tmp_path / "robustness.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 4
     curve = robustness.curve_of(rows, "stabilize", "lqr", "mass")
-    np.testing.assert_array_equal([row.told["level"] for row in curve], [-20, 0, 20])
+    np.testing.assert_array_equal([row.labels["level"] for row in curve], [-20, 0, 20])
     figure = figures.robustness_figure(rows, "stabilize")
     assert figures.save(figure, tmp_path / "curves.png").exists()
     ticks = [tick.get_text() for axis in figure.axes for tick in (*axis.get_xticklabels(), *axis.get_yticklabels())]

@@ -134,7 +134,7 @@ def test_an_end_that_is_none_is_refused(forge, submitted):
         "actions": np.concatenate([honest.actions, np.zeros((1, 2))]),
     }
     with pytest.raises(
-        SubmissionError, match=r"episode 1, step \d+: the episode has ended here, and the recording goes on"
+        SubmissionError, match=r"episode 1, step \d+: the episode has ended here, but the recording continues"
     ):
         forge(**later)
 
@@ -310,7 +310,7 @@ def test_a_row_needs_its_submission_or_a_line_in_the_list_of_releases(submitted,
     entry = verify(submitted()[1], EPISODES)
     row, submission = entry.write(tmp_path), tmp_path / "turn-mine-rk4.npz"
     (missing,) = unbacked(tmp_path, EPISODES)
-    assert missing.startswith("turn-mine-rk4.json: no submission lies beside it")
+    assert missing.startswith("turn-mine-rk4.json: its submission is neither in the folder nor downloaded")
     files.write(submission, submitted()[1].read_bytes())
     assert unbacked(tmp_path, EPISODES) == []
     release(tmp_path, EPISODES)
@@ -422,7 +422,10 @@ def test_a_row_and_its_line_in_the_list_that_are_edited_together_do_not_match_th
         files.write(board / "released.txt", f"{digest_of(forged)}  {forged.file}\n")
         assert unbacked(board, EPISODES) == []
         (wrong,) = unbacked(board, EPISODES, downloaded)
-        assert "its submission gives another row" in wrong or "no submission lies beside it or was downloaded" in wrong
+        assert (
+            "its submission gives another row" in wrong
+            or "its submission is neither in the folder nor downloaded" in wrong
+        )
 
 
 @pytest.mark.parametrize("task", ["stabilize", "turn"])

@@ -56,7 +56,9 @@ def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
 def test_experts_of_a_track_meet_that_track_alone_unless_they_are_named():
     def met(controllers, experts):
         groups = groups_of({"orbit": controllers}, ["late", "noisy"], "rk4", experts=experts)
-        return [[group.controller for group in groups if group.told["stress"] == track] for track in ("late", "noisy")]
+        return [
+            [group.controller for group in groups if group.labels["stress"] == track] for track in ("late", "noisy")
+        ]
 
     assert met(["lqr", "shac-late"], EXPERTS) == [["lqr", "shac-late", "nmpc-adaptive"], ["lqr", "nmpc-ekf"]]
     assert met(["nmpc-ekf"], {}) == [["nmpc-ekf"], ["nmpc-ekf"]]

@@ -31,7 +31,7 @@ from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
-_NO_READER = 141  # as of what the signal SIGPIPE ends
+_NO_READER = 141  # the exit status of a process that the signal SIGPIPE ended
 _ID = re.compile(r"([\w-]+/)?\w+-v\d+")  # of an environment
 _MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[a-z][a-z0-9_]*")
 
@@ -39,7 +39,7 @@ _MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[a-z][a-z0-9_]*")
 def main() -> None:
     """Runs the command line; errors a user can cause end with one line and exit status 1, misused commands with 2.
 
-    Where nobody reads what is printed any more, as behind `| head`, it ends without a word.
+    It ends silently when the reader of its output has closed the pipe, for example behind `| head`.
     """
     try:
         try:
@@ -126,8 +126,8 @@ def _call(command: str, options: list[str]) -> Any:
 
     from ballbot_gym.lazy import load
 
-    # Before torch, NumPy or CasADi are imported, here and in the processes of this one: these nets and batches are too small
-    # for a second thread, and beside other work threads wait for each other at every operation.
+    # This must happen before torch, NumPy or CasADi are imported, here and in child processes. These networks and batches are
+    # too small for a second thread, and on a busy machine threads wait for each other at every operation.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     _announce_compilation()
     options = _registered(options)

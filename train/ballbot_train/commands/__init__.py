@@ -19,7 +19,7 @@ COMMANDS = {name: f"{__name__}.{name}:{name}" for names in GROUPS.values() for n
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 
 MOVED = {"tune": "`ballbot tune` is an example now: python examples/tune.py --task TASK (in the source repository)"}
-"""What to do in place of commands of earlier versions."""
+"""What to do instead of commands of earlier versions."""
 
 RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train")
 """Those that continue where they were interrupted; `train` does it with --resume."""

@@ -23,10 +23,10 @@ def basins(
     robot: RobotName = PAPER,
     filter: Filter | None = None,
 ) -> None:
-    """Maps for Stabilize from which leans, speeds and lean rates each controller recovers, within what the robot allows.
+    """Maps the leans, speeds and lean rates in Stabilize that each controller recovers from, within the robot's limits.
 
     Args:
-        controllers: as of `ballbot benchmark`.
+        controllers: same as in `ballbot benchmark`.
         points: along each axis of a map; odd.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.

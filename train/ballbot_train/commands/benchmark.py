@@ -49,9 +49,9 @@ def benchmark(
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
-        randomization: names of tracks, "unknown", "late", "noisy" or "real": robots, delays and sensors that nobody told the
-            controllers. Then the result is one table of controllers by tracks, with the parts of their regret; by default
-            with the experts that are made for each track.
+        randomization: names of tracks, "unknown", "late", "noisy" or "real". Their robots, delays and sensors are hidden from
+            the controllers. The result is then one table of controllers by tracks, with the parts of their regret. By default
+            the experts that are made for each track run.
         filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
     chosen = controllers_of(tasks, all_behind(controllers, filter), robot, tracks=bool(randomization))

@@ -1,4 +1,4 @@
-"""`ballbot certify`: the certified evaluation sets anew."""
+"""`ballbot certify`: recomputes the certified evaluation sets."""
 
 from functools import partial
 from pathlib import Path
@@ -38,12 +38,12 @@ def certify(
     Args:
         tasks: names of tasks.
         episodes: how many, from the first.
-        shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
+        shards: URL or folder for a set of shards, SHARDS/TASK, instead of the .npz files; for more episodes than fit into
             memory. See `ballbot_train.work.shards`.
         out: folder of the .npz files.
         workers: who does the work.
         robot: whose sets.
-        randomization: name of the track from which each episode's robot and delay are drawn; default, none.
+        randomization: name of the track that each episode's robot and delay are drawn from; default, none.
     """
     check_some("task", tasks, TASKS)
     check_least(1, episodes=episodes)

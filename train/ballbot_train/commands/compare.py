@@ -21,8 +21,8 @@ def compare(
         a: folder of a benchmark, or its leaderboard.json; or the name of a row of the leaderboard, as lqr.
         b: the other.
         match: a controller of A and one of B, to compare controllers of different names.
-        training_margin: differences of success and regret up to this decide nothing between policies with different weights,
-            which the seed of their training makes differ; 0.02 is 2 %. Other controllers are told apart from 0.1 % on.
+        training_margin: between policies with different weights, smaller differences of success and regret decide nothing,
+            because another training seed changes as much; 0.02 is 2 %. Between other controllers 0.1 % decides.
     """
     runs = read_run(a), read_run(b)
     compared = comparison.compare(runs[0], runs[1], match, training_margin)

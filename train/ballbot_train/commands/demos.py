@@ -23,7 +23,7 @@ def demos(
 
     Args:
         config: what is recorded.
-        shards: URL or folder for a set of shards in place of a Minari dataset, for more episodes than fit into memory; see
+        shards: URL or folder for a set of shards instead of a Minari dataset, for more episodes than fit into memory; see
             `ballbot_train.work.shards`.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
         workers: who does the work.

@@ -33,7 +33,7 @@ from ballbot_train.work.provenance import provenance
 _OPTIMA = 100  # fresh episodes whose regret is shown unless another number is given
 _WORST = 10
 _SHOWN_BINS = 6
-_FULL_BIN = 20  # episodes from which a bin is called weak
+_FULL_BIN = 20  # a bin with fewer episodes is not called weak
 
 
 def evaluate(

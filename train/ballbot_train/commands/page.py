@@ -9,7 +9,7 @@ def page(policies: tuple[str, ...] = (), /, out: Path = Path("runs/page/playgrou
     """Writes the playground as one HTML page: push a learned policy and LQR, without Python and without network.
 
     Args:
-        policies: policy files, each shown in place of the shipped policy of its task.
+        policies: policy files; each replaces the shipped policy of its task on the page.
         out: path of the page.
     """
     from ballbot_train.report.playground import write_playground  # it imports casadi

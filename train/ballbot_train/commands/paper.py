@@ -24,7 +24,7 @@ _GREY = (0.75, 0.75, 0.75, 1.0)
 
 
 def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
-    """Regenerates the paper's Figs 2 to 5: each optimum beside its execution in PyBullet.
+    """Regenerates the paper's Figs 2 to 5: each optimum compared with its execution in PyBullet.
 
     Args:
         out: folder of the figures and plans.

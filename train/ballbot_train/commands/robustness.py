@@ -31,7 +31,7 @@ def robustness(
 
     Args:
         tasks: names of tasks.
-        controllers: as of `ballbot benchmark`; by default NMPC with a disturbance estimator, nmpc-offset-free, runs too.
+        controllers: same as in `ballbot benchmark`; by default nmpc-offset-free, NMPC with a disturbance estimator, runs too.
         stresses: names of disturbances.
         episodes: how many of each task's certified episodes.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
@@ -74,10 +74,10 @@ def _joined(values: Iterable[float]) -> str:
 
 _TABLE: dict[str, Callable[[list[Row]], str]] = {
     "task": lambda curve: curve[0].task,
-    "disturbance": lambda curve: curve[-1].told["stress"],
+    "disturbance": lambda curve: curve[-1].labels["stress"],
     "controller": lambda curve: curve[0].controller,
     "physics": lambda curve: curve[0].physics,
-    "severity": lambda curve: " · ".join(f"{row.told['level']:g}" for row in curve),
+    "severity": lambda curve: " · ".join(f"{row.labels['level']:g}" for row in curve),
     "success, %": lambda curve: _joined(100 * row.success for row in curve),
     "falls, %": lambda curve: _joined(100 * row.falls / row.episodes for row in curve),
     stressed.REGRET: lambda curve: _joined(100 * row.regret_mean for row in curve),

@@ -47,7 +47,7 @@ class Run:
     history: int = number(0, 0)
     """Earlier observations and actions that are seen."""
     informed: bool = False
-    """The policy is told each robot, and runs behind a filter."""
+    """The policy gets each robot's parameters, and runs behind a filter that estimates them."""
     threads: int = number(1, 1, 1024)
     """Threads of torch."""
     test_episodes: int = number(certified.EPISODES, 1, certified.EPISODES)

@@ -22,10 +22,10 @@ _IN_CSV = {
 }
 _TABLE: dict[str, Callable[[Row], str]] = {
     "task": lambda row: row.task,
-    "made for": lambda row: row.told["made_for"],
+    "made for": lambda row: row.labels["made_for"],
     "controller": lambda row: row.controller,
-    "runs on": lambda row: row.told["robot"],
-    "friction": lambda row: shown(row.told["friction"], "g"),
+    "runs on": lambda row: row.labels["robot"],
+    "friction": lambda row: shown(row.labels["friction"], "g"),
     "physics": lambda row: row.physics,
     "success": lambda row: f"{100 * row.success:.1f} %",
     "falls": lambda row: f"{row.falls}/{row.episodes}",
@@ -52,7 +52,7 @@ def transfer(
     Args:
         tasks: names of tasks.
         controllers: names of experts and policies; default all that the robots have.
-        made_for: names of the robots that they were made for: what they plan for, and what policies learnt on.
+        made_for: names of the robots that experts plan for and policies were trained on.
         robot: what they run on, with its certified episodes.
         frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
         episodes: how many of each task's certified episodes.
@@ -80,7 +80,7 @@ def transfer(
             robot,
             made_for=own,
             friction=friction,
-            told={"made_for": own, "robot": robot, "friction": getattr(floor(robot, friction), "friction", None)},
+            labels={"made_for": own, "robot": robot, "friction": getattr(floor(robot, friction), "friction", None)},
         )
         for own, by_task in chosen.items()
         for task, names in by_task.items()

@@ -1,4 +1,4 @@
-"""Basins of attraction: the states from which each controller brings the robot to rest, and those from which any could.
+"""Basins of attraction: the states that each controller brings to rest, and the states that any controller could.
 
 A map spans the lean γ and one other component of Stabilize's initial state; the rest is zero. A state is recovered if the
 episode succeeds: at rest at the origin when it ends. It is recoverable if it lies within the boundary that
@@ -114,13 +114,13 @@ def cells_of(bounds: Mapping[str, np.ndarray], points: int) -> dict[str, np.ndar
 def groups_of(
     cells: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str, robot: str = PAPER
 ) -> list[runner.Group]:
-    """What to run, for `run_groups`: every controller from all states of each map. Results are told by their "axis"."""
+    """What to run, for `run_groups`: every controller from all states of each map. Results are labelled with their "axis"."""
     groups = []
     for name, chosen in cells.items():
         leans, values = grid(name, points)
         starts = np.zeros((len(chosen), named_robot(robot).state_size))
         starts[:, AXES[name].component], starts[:, 2] = values[chosen[:, 0]], np.radians(leans[chosen[:, 1]])
-        world: dict[str, Any] = {"starts": starts, "fields": {"arena_radius": _ARENA_RADIUS}, "told": {"axis": name}}
+        world: dict[str, Any] = {"starts": starts, "fields": {"arena_radius": _ARENA_RADIUS}, "labels": {"axis": name}}
         groups += [runner.Group(TASK, each, physics, robot, counts_for=each, **world) for each in controllers]
     return groups
 
@@ -135,7 +135,7 @@ def maps_of(
     """The maps that the results of all states make up."""
     recovered = {name: {c: np.zeros((points, points), bool) for c in controllers} for name in bounds}
     for result in results:
-        axis = result.told["axis"]
+        axis = result.labels["axis"]
         found, (i, j) = recovered[axis][result.controller], cells[axis][result.episode]
         found[i, j] |= result.success
         found[-1 - i, -1 - j] |= result.success
@@ -148,7 +148,7 @@ def maps_of(
 
 
 def fraction(maps: Sequence[BasinMap], controller: str) -> float:
-    """The share of the recoverable states of maps from which a controller recovers."""
+    """The share of the recoverable states of maps that a controller brings to rest."""
     recovered = sum(int(np.sum(basin.recovered[controller])) for basin in maps)
     return recovered / sum(int(np.sum(basin.recoverable)) for basin in maps)
 

@@ -5,8 +5,8 @@ episode and its 95 % bootstrap interval are reported. They decide only beyond a 
 
 - Success decides first, if a sign test over the episodes in which only one of the two succeeded agrees, because the bootstrap
   interval of a handful of falls is too narrow. Otherwise regret decides, over the episodes in which neither failed.
-- Training with another seed gives another policy. Each method is represented by one seed, so no number of episodes tells the
-  methods apart. Policies with different weights must therefore differ by more than `TRAINING_MARGIN`, which is about what a
+- Training with another seed gives another policy. Each method is represented by one seed, so no number of episodes separates
+  the methods. Policies with different weights must therefore differ by more than `TRAINING_MARGIN`, which is about what a
   seed changes. To compare methods more finely, train several seeds of each.
 """
 

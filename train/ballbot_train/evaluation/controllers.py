@@ -33,7 +33,7 @@ def _experts() -> ModuleType:
 
 
 def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
-    """The controllers that a task has for a robot, experts first; tracks as of `shipped_policies`."""
+    """The controllers that a task has for a robot, experts first; for `track` see `shipped_policies`."""
     return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
@@ -100,7 +100,7 @@ def _is_saved_model(name: str) -> bool:
 
 
 def _acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether a task has a controller of that name for a robot; of a file as of `_is_made_for`."""
+    """Whether a task has a controller of that name for a robot. For files see `_is_made_for`."""
     if is_file(name):
         return _is_made_for(name, task, robot)
     alone, filter = split(name)
@@ -109,7 +109,7 @@ def _acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
 
 
 def _is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether the policy of a file is one for a task and a robot. A saved model tells only its spaces.
+    """Whether the policy of a file is one for a task and a robot. A saved model is judged by its spaces alone.
 
     Raises:
         PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.

@@ -85,8 +85,8 @@ def evaluate(
         episodes: how many of the certified episodes, from the first.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
-        randomization: what the policy is not told, or a name in `TRACKS`; default, nothing. The regret is over the optimum
-            of each episode's own robot and delay, which a policy could only reach that knows them.
+        randomization: parameters hidden from the policy, or a name in `TRACKS`; default, none. Regret is measured against
+            the optimum of each episode's own robot and delay, although the policy does not get them.
         robot: a name in `ROBOTS`, or any Robot.
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
@@ -170,7 +170,7 @@ class _Held:
         return cls(*(read_results(out) if (out / "leaderboard.json").exists() else ({}, [])))
 
     def file(self, task: str, name: str) -> str | None:
-        """The policy file of a row; None where there is no such row, or nobody knows its file."""
+        """The policy file of a row; None if there is no such row, or its file was not recorded."""
         return self.about.get("files", {}).get(f"{task}/{name}")
 
     def joined(
@@ -217,6 +217,6 @@ def _name(policy: Any, file: str, task: str, held: _Held | None) -> str:
     parts = Path(policy).absolute().parts if len(Path(policy).parts) > 1 else Path(policy).parts
     names = [
         str(Path(*parts[-n:])) for n in range(min(2, len(parts)), len(parts) + 1)
-    ]  # a run's folder tells its policy
+    ]  # the folder of a run identifies its policy
     free = (name for name in names if held is None or held.file(task, name) in (None, file))
     return next(free, names[-1])

@@ -45,7 +45,7 @@ EPISODES = 10_000
 _MOST_EPISODES = 1_000_000
 _BATCH = 2500  # episodes that run at once
 _PURPOSES = {"evaluation": 0, "validation": 1, "training": 2}
-_DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
+_DISCRETE = 12  # values; a quantity with no more than these gets a bin for each of them
 _PER_BIN = 125  # episodes of a bin on average
 _MOST_BINS = 80
 
@@ -237,8 +237,8 @@ def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> Bat
     """A policy as a function from observations to actions, for one episode of each environment of a batch.
 
     Args:
-        policy: a policy file, a saved model, the name of a shipped policy, of which a filter's may follow, a model with
-            Stable-Baselines3's `predict`, or a function of tensors such as a `PolicyNetwork`. It is given float32.
+        policy: a policy file, a saved model, the name of a shipped policy, perhaps followed by that of a filter, a model with
+            Stable-Baselines3's `predict`, or a function of tensors such as a `PolicyNetwork`. It gets float32.
         batch: where it acts.
         robot: by name, of a policy by name or file.
 
@@ -279,7 +279,7 @@ def _controller(policy: str, task: Task, robot: str) -> Controller:
 
 
 def _behind_filter(controller: Controller, batch: BallbotBatch) -> BatchPolicy:
-    """The controller as a function of observations, in place of which it takes what sensors report of states."""
+    """The controller as a function of observations. It ignores them, and takes the readings of the batch's sensors."""
     steps = itertools.count()
 
     def act(observation: torch.Tensor) -> torch.Tensor:
@@ -305,14 +305,14 @@ def evaluate_fresh(
     """Runs a policy on fresh episodes.
 
     Args:
-        policy: as of `as_batch_policy`.
+        policy: see `as_batch_policy`.
         task: a name in `TASKS`, or a Task.
         episodes: how many.
         seed: of the episodes.
         name: of the policy in the result; default, its own.
         on_progress: called with a number of finished episodes.
         robot: by name.
-        randomization: what the policy is not told, or a name in `TRACKS`; default, nothing.
+        randomization: parameters hidden from the policy, or a name in `TRACKS`; default, none.
 
     Raises:
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.

@@ -77,8 +77,8 @@ def judged(
     did = outcome(task, steps.before, force, steps.after, c, steps.step, grip)
     over = np.broadcast_to(did.terminated + did.truncated > 0, steps.step.shape)
     last = steps.step == steps.lengths[steps.episode]
-    steps.refuse(over & ~last, lambda i: "the episode has ended here, and the recording goes on")
-    steps.refuse(last & ~over, lambda i: "the recording stops here, and the episode has not ended")
+    steps.refuse(over & ~last, lambda i: "the episode has ended here, but the recording continues")
+    steps.refuse(last & ~over, lambda i: "the recording stops here, but the episode has not ended")
     n = len(steps.lengths)
     cost = np.bincount(steps.episode, np.broadcast_to(did.cost, steps.step.shape), n)
     cost[steps.lengths == 0] = task.survival_pay

@@ -41,8 +41,8 @@ def with_way(name: str, way: str) -> str:
     """A controller's name behind the learners that came before it on the way of its training: "dagger → shac → ppo".
 
     Args:
-        name: of a shipped policy, as "ppo" or "shac-late", or anything else, which stays as it is where there is no way.
-        way: its whole way, as `policy_files.way_of` tells it.
+        name: of a shipped policy, such as "ppo" or "shac-late". Any other name stays as it is if there is no way.
+        way: its whole way, from `policy_files.way_of`.
     """
     before, arrow, _ = way.rpartition(ARROW)
     return f"{before}{arrow}{name}" if not Path(name).suffix else name

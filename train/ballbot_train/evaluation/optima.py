@@ -76,7 +76,7 @@ def compute(
         task: and params: the problem.
         episodes: their indices.
         workers: processes that compute, or `Workers`.
-        randomization: as of `known`.
+        randomization: see `known`.
 
     Raises:
         PlanError: an episode has no optimum; all others are kept.

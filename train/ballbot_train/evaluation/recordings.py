@@ -35,11 +35,11 @@ ACTION_GRID = 2.0**-28
 FOLDER = "recordings"
 """Of a results folder."""
 LARGEST_FILE = 4 * 2**20  # bytes
-_LARGEST_UNPACKED = 2**26  # bytes, as of one that holds 200 episodes of 8,000 control steps
+_LARGEST_UNPACKED = 2**26  # bytes; 200 episodes of 8,000 control steps need as many
 _ABOUT_LIMIT = 2**14  # bytes
 _ARRAYS = {"about", "lengths", "states", "actions"}
 _BYTES = 5  # of a second difference
-_MOST = 2**36  # grid units, of which no second difference needs more
+_MOST = 2**36  # grid units; no second difference needs more
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _sizes_of(facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[int
 def _packed(values: np.ndarray) -> np.ndarray:
     """The second differences of (n, m) along n, as planes of their bytes (5, m, n); small numbers have zeros there.
 
-    Values are rounded. What no whole number holds, as of a simulation that exploded, is cut off.
+    Values are rounded. Values too large for an integer, such as those of a diverged simulation, are clipped.
     """
     whole = np.rint(np.clip(values, -_MOST, _MOST)).astype(np.int64)
     differences = np.diff(whole, 2, axis=0, prepend=np.zeros((2, whole.shape[1]), np.int64))

@@ -1,7 +1,7 @@
-"""Which rows of the leaderboard are backed by a submission: one that lies beside the row, or one in a release.
+"""Checks that a submission backs every row of the leaderboard. It lies in the folder of the row, or in a release.
 
-`released.txt` beside the rows has a line for each row whose submission moved to a release: the digest of what the row says,
-and the name of its file. So a row that was edited, added or removed by hand is found.
+`released.txt` in the same folder has a line for each row whose submission moved to a release: the digest of the row's content
+and the name of its file. This reveals a row that was edited, added or removed by hand.
 """
 
 import hashlib
@@ -54,7 +54,7 @@ def unbacked(
 ) -> list[str]:
     """What is wrong with a leaderboard's rows, one sentence each; empty where every row is backed.
 
-    A submission that lies beside its row is verified again, which takes seconds.
+    A submission in the folder of its row is verified again, which takes seconds.
 
     Args:
         folder: of the rows.
@@ -67,7 +67,7 @@ def unbacked(
     found = {path.name for path in folder.glob("*.json")}
     wrong = [f"{name}: the row is missing, and {LIST} has it" for name in released.keys() - found]
     wrong += [
-        f"{path.name}: no row lies beside this submission; ballbot verify {path.name} --write {folder.name}"
+        f"{path.name}: this submission has no row; run ballbot verify {path.name} --write {folder.name}"
         for path in folder.glob("*.npz")
         if path.with_suffix(".json").name not in found
     ]
@@ -81,7 +81,7 @@ def unbacked(
 
 
 def release(folder: Path = LEADERBOARD, episodes: int = certified.EPISODES) -> Path:
-    """Lists every row that is backed, before the submissions beside them move to a release.
+    """Lists every row that is backed, before the submissions next to them move to a release.
 
     Raises:
         ValueError: a row is edited or added by hand.
@@ -114,5 +114,5 @@ def _unbacked(entry: Entry, submission: Path | None, released: dict[str, str], e
         again = f"ballbot verify {submission} --write {LEADERBOARD.name}"
         return "" if verified == entry else f"its submission gives another row; {again}"
     if entry.file not in released:
-        return f"no submission lies beside it or was downloaded, and no {LIST} that counts has it"
+        return f"its submission is neither in the folder nor downloaded, and no {LIST} that counts has the row"
     return "" if released[entry.file] == digest_of(entry) else f"it is not the row that {LIST} has"

@@ -37,8 +37,8 @@ class Result:
     """Mean of |F| over the episode, N."""
     note: str = ""
     """Why there is no trajectory: the message of the controller that found no plan."""
-    told: Mapping[str, Any] = field(default_factory=dict)
-    """What else tells the episode from others, such as a disturbance; columns of their own in files."""
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    """Further labels of the episode, such as a disturbance. Each is a column of its own in files."""
 
     @property
     def regret(self) -> float:
@@ -70,8 +70,8 @@ class Row(Displayed):
     """Mean of |F|, N."""
     plan_ms_median: float
     step_us_median: float
-    told: Mapping[str, Any] = field(default_factory=dict)
-    """What else tells the row from others; columns of their own in files."""
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    """Further labels of the row. Each is a column of its own in files."""
 
     def facts(self) -> dict[str, str]:
         return {
@@ -113,22 +113,22 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
         effort_mean=float(np.mean([result.effort for result in standing])) if standing else math.nan,
         plan_ms_median=1e3 * median(result.plan_seconds for result in results),
         step_us_median=1e6 * median(result.step_seconds for result in results),
-        told=results[0].told,
+        labels=results[0].labels,
     )
 
 
 def columns(entry: Any) -> dict[str, Any]:
-    """The fields of a dataclass instance by name, with what a result or a row is told by beside them."""
+    """The fields of a dataclass instance by name, followed by the labels of a result or a row."""
     named = asdict(entry)
-    told = named.pop("told", {})
-    return named | told
+    labels = named.pop("labels", {})
+    return named | labels
 
 
 def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
-    """One row for each task, controller, engine and what the results are told by, in order; seed is of the bootstrap."""
+    """One row for each task, controller, engine and set of labels, in order. The seed is that of the bootstrap."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in results:
-        groups.setdefault((result.task, result.controller, result.physics, *result.told.items()), []).append(result)
+        groups.setdefault((result.task, result.controller, result.physics, *result.labels.items()), []).append(result)
     return [summarize(group, seed) for group in groups.values()]
 
 
@@ -183,7 +183,7 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
 
 def _from_json(entry: Mapping[str, Any]) -> Result:
     values: dict[str, Any] = {key: math.nan if value is None else value for key, value in entry.items()}
-    for each in fields(Result)[:-1]:  # all but what results of a leaderboard are not told by
+    for each in fields(Result)[:-1]:  # without the labels, which results of a leaderboard do not have
         value, kind = values.get(each.name, each.default), cast(Any, each.type)
         fits = isinstance(value, (int, float) if kind is float else kind)
         if not fits or (isinstance(value, bool) and kind is not bool):
@@ -253,17 +253,17 @@ def cells(row: Row) -> list[str]:
 def table_cells(
     shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any], ways: Mapping[str, str] = {}
 ) -> list[list[str]]:
-    """Rows as text, under the headers of what is `shown` of each. Paths of policies are as short as tells them apart.
+    """Rows as text, one cell for each entry of `shown`. Paths of policies are as short as possible while they differ.
 
-    `ways` are the whole ways of shipped policies by "TASK/NAME", as of `benchmark.open_run`.
+    `ways` are the whole ways of shipped policies by "TASK/NAME", see `open_run`.
     """
     table = [[text(row) for text in shown.values()] for row in rows]
     if "controller" in shown:
         place = list(shown).index("controller")
         short = shortened(line[place] for line in table)
         for row, line in zip(rows, table, strict=True):
-            told, key = getattr(row, "told", {}), f"{shown['task'](row)}/{line[place]}"
-            if "made_for" in told and told["made_for"] != told["robot"]:
-                key = f"{told['made_for']}/{key}"
+            labels, key = getattr(row, "labels", {}), f"{shown['task'](row)}/{line[place]}"
+            if "made_for" in labels and labels["made_for"] != labels["robot"]:
+                key = f"{labels['made_for']}/{key}"
             line[place] = with_way(short[line[place]], ways.get(key, ""))
     return table

@@ -5,13 +5,13 @@ meets the same draws. Under a stress, regret is measured against the undisturbed
 it.
 
 The tracks of `ballbot_gym.robot.randomization` are unknown robots. Every episode has an optimum of its own there: that of its
-robot, whose first forces are none while its delay lasts. Who reaches it would have to know what was drawn. In units of
-that optimum J, regret splits into what adds up:
+robot, whose first forces are zero while its delay lasts. Only a controller with access to the drawn parameters could reach
+it. In units of that optimum J, regret is the sum of two parts:
 
 - what not knowing costs: how far the best controller of the table is from J in the same episode,
-- what the controller loses: how much dearer it is than that one.
+- what the controller loses: how much more it costs than that best controller.
 
-What delay costs is told beside them, because no controller could avoid it: J less the optimum without delay.
+What delay costs is a column of its own, because no controller could avoid it: J minus the optimum without delay.
 """
 
 import math
@@ -100,11 +100,11 @@ def groups_of(
     robot: str = PAPER,
     experts: Mapping[str, Sequence[str]] = {},
 ) -> list[Group]:
-    """What to run, for `run_groups`, whose results are told by "stress" and "level". Tracks have level 0.
+    """What to run, for `run_groups`. Results are labelled with "stress" and "level". Tracks have level 0.
 
     Args:
         controllers: names by task. Policies that were trained on a track meet that track alone.
-        names: in `TRACKS`; or in `STRESSES`, of which every level is run, and the undisturbed once.
+        names: in `TRACKS` or `STRESSES`. Every level of a stress is run, and the undisturbed episodes once.
         physics: "bullet", "mujoco" or "rk4".
         robot: by name.
         experts: more controllers, by the track that they meet.
@@ -121,7 +121,7 @@ def groups_of(
             robot,
             randomization=randomization,
             own_optima=name in TRACKS,
-            told={"stress": name, "level": level},
+            labels={"stress": name, "level": level},
             counts_for=name,
         )
         for name, level, randomization in conditions
@@ -134,25 +134,27 @@ def groups_of(
 def curve_of(rows: Sequence[Row], task: str, controller: str, stress: str) -> list[Row]:
     """The rows of one curve, by severity, the undisturbed among them."""
     chosen = [row for row in rows if (row.task, row.controller) == (task, controller)]
-    chosen = [row for row in chosen if row.told["stress"] in (stress, NONE)]
-    return sorted(chosen, key=lambda row: row.told["level"])
+    chosen = [row for row in chosen if row.labels["stress"] in (stress, NONE)]
+    return sorted(chosen, key=lambda row: row.labels["level"])
 
 
 def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> list[Row]:
     """One row per track, task and controller; seed is of the bootstrap.
 
-    A row is told by its "track" and by shares of the mean, in units of the episode's optimum, NaN without an episode:
-    "delay_costs", what delay adds to the optimum; "not_knowing_costs", the regret of the "best" controller in the episodes in
-    which neither fails; "controller_loses", the regret beyond that in the same episodes. The best controller is, of those
-    that succeed most often, the one of least mean regret.
+    The labels of a row are its "track", the "best" controller of the track and task, and three means over episodes, in units
+    of the episode's optimum, NaN without an episode: "delay_costs", what delay adds to the optimum; "not_knowing_costs", the
+    regret of the best controller in the episodes in which neither of the two fails; "controller_loses", the row's further
+    regret in the same episodes. The best controller has the least mean regret among those that succeed most often.
     """
     regrets: dict[tuple[str, str, str], dict[int, float]] = {}
     for result in results:
-        regrets.setdefault((result.told["stress"], result.task, result.controller), {})[result.episode] = result.regret
+        regrets.setdefault((result.labels["stress"], result.task, result.controller), {})[result.episode] = (
+            result.regret
+        )
     plain, rows = leaderboard(results, seed), []
     for row in plain:
-        track, task = row.told["stress"], row.task
-        rivals = [other for other in plain if (other.told["stress"], other.task) == (track, task)]
+        track, task = row.labels["stress"], row.task
+        rivals = [other for other in plain if (other.labels["stress"], other.task) == (track, task)]
         best = min(rivals, key=lambda other: (-other.success, np.nan_to_num(other.regret_mean, nan=np.inf))).controller
         own, of_best = (regrets[track, task, name] for name in (row.controller, best))
         known = optima.known(make_task(task, robot), robot, own, randomization=TRACKS[track])
@@ -161,7 +163,7 @@ def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> 
         pairs = pairs[np.isfinite(pairs).all(axis=1)]
         unknown, lost = pairs.mean(axis=0).tolist() if len(pairs) else (math.nan, math.nan)
         costs = {"delay_costs": delay, "not_knowing_costs": unknown, "controller_loses": lost - unknown}
-        rows.append(replace(row, told={"track": track, **costs, "best": best}))
+        rows.append(replace(row, labels={"track": track, **costs, "best": best}))
     return rows
 
 
@@ -170,7 +172,7 @@ def _percent(*values: float) -> str:
 
 
 TRACK_TABLE: dict[str, Callable[[Row], str]] = {
-    "track": lambda row: row.told["track"],
+    "track": lambda row: row.labels["track"],
     "task": lambda row: row.task,
     "controller": lambda row: row.controller,
     "physics": lambda row: row.physics,
@@ -178,8 +180,8 @@ TRACK_TABLE: dict[str, Callable[[Row], str]] = {
     "failures": lambda row: f"{row.falls} of {row.episodes}",
     "mean regret, %": lambda row: _percent(row.regret_mean),
     "95 % interval": lambda row: _percent(row.regret_low, row.regret_high),
-    "delay costs, %": lambda row: _percent(row.told["delay_costs"]),
-    "not knowing costs, %": lambda row: _percent(row.told["not_knowing_costs"]),
-    "controller loses, %": lambda row: _percent(row.told["controller_loses"]),
+    "delay costs, %": lambda row: _percent(row.labels["delay_costs"]),
+    "not knowing costs, %": lambda row: _percent(row.labels["not_knowing_costs"]),
+    "controller loses, %": lambda row: _percent(row.labels["controller_loses"]),
 }
 """What the table of tracks shows of a row of `track_rows`."""

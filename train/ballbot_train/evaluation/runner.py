@@ -137,7 +137,7 @@ class Group:
     made_for: str | None = None
     """Name of the robot that the controller is made for; default, `robot`. It plans and observes as for that one."""
     friction: float | None = None
-    """Of the floor, as of `floor`; regret is over the optimum on the robot's own floor then too."""
+    """Of the floor, see `floor`. Regret is then still measured against the optimum on the robot's own floor."""
     randomization: Randomization = Randomization()
     own_optima: bool = False
     """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
@@ -145,8 +145,8 @@ class Group:
     """(n, state size) initial states that replace the certified episodes; there is no regret then."""
     fields: Mapping[str, Any] = field(default_factory=dict)
     """Fields of the task that are not its defaults."""
-    told: Mapping[str, Any] = field(default_factory=dict)
-    """What the results are told by."""
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    """Labels of its results, see `Result.labels`."""
     counts_for: str = ""
     """What its progress counts for; default, the task."""
 
@@ -198,7 +198,7 @@ def run_groups(
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
             who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
             recordings.write_in(out, motions, task, group.task, params, *who)
-        results += [Result(**entry, told=group.told) for entry in entries]
+        results += [Result(**entry, labels=group.labels) for entry in entries]
     return results
 
 
@@ -216,7 +216,7 @@ def _jobs_of(
     """The jobs of a group, of `CHUNK` episodes each."""
     chosen = known[group.problem] if group.starts is None else _without_optima(group.starts)
     sent, recorded = registry.portable(group.controller, *group.believed), record
-    words = "-".join(map(str, (group.task, group.controller, group.physics, *group.told.values())))
+    words = "-".join(map(str, (group.task, group.controller, group.physics, *group.labels.values())))
     count = episodes if group.starts is None else len(group.starts)
     group = replace(group, starts=None)  # they are in the set
     for start in range(0, count, CHUNK):
@@ -259,7 +259,7 @@ def shown_to(controller: Controller, env: BallbotEnv) -> BallbotEnv:
 
 
 def checked_episodes(episodes: int) -> int:
-    """A number of certified episodes; raises a ValueError where there are not so many."""
+    """A number of certified episodes; raises a ValueError if there are fewer."""
     if isinstance(episodes, bool) or not isinstance(episodes, numbers.Integral):
         raise TypeError(f"episodes must be a number of episodes, not {episodes!r}")
     if not 1 <= episodes <= certified.EPISODES:

@@ -31,10 +31,10 @@ def steered(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.n
 
 
 def costates(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The slopes (n, 8) of an episode's cost with respect to the state after each step; arguments as of `steered`.
+    """The slopes (n, 8) of an episode's cost with respect to the state after each step; for the arguments see `steered`.
 
-    After a deviation time-varying LQR steers back to the motion. Along an optimum the slopes do not depend on how one steers
-    back. If nobody did, they would grow as fast as the robot falls.
+    After a deviation time-varying LQR steers back to the motion. Along an optimum the slopes do not depend on the
+    feedback. Without feedback they would grow as fast as the robot falls.
     """
     n, dt = len(action), task.control_dt
     force, before = robot.force_limit * action, x[:-1]

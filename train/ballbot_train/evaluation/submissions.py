@@ -62,7 +62,7 @@ class Entry:
     robot: str
     physics: str
     policy: str
-    """SHA-256 of the weights; "" where there are none, or nobody knows them."""
+    """SHA-256 of the weights; "" if there are none, or they were not recorded."""
     submission: str
     """SHA-256 of the file that was verified."""
     versions: dict[str, str]
@@ -79,12 +79,12 @@ class Entry:
     regret_high: float | None = None
     regret_median: float | None = None
     steered: float | None = None
-    """No more than this part of an episode's cost can be due to errors of the recording; null where nobody checked it."""
+    """No more than this part of an episode's cost can be due to errors of the recording; null if it was not checked."""
     optima: int = 0
     """How many episodes are the certified optimal motions to 1e-6, of those whose optimal motions are known."""
 
     def results(self) -> list[Result]:
-        """Its episodes, beside the certified optima as they are now."""
+        """Its episodes, with the certified optima of the installed version."""
         optima = certified.load(self.task, self.robot).costs
         return [
             Result(
@@ -203,7 +203,7 @@ def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str,
         if recording.about.get("controller") == (controller or names[0]):
             about = _checked_facts(recording.about | {"name": name, "link": link}, path)
             row = Entry(**{key: about[key] for key in _FACTS}, submission="", costs=[], ends=[])
-            file = Path(row.file).with_suffix(".npz").name  # so it can lie beside its row
+            file = Path(row.file).with_suffix(".npz").name  # so that it can lie in the folder of its row
             if file in packed:
                 raise SubmissionError(
                     f"{results} holds two recordings for {file}; evaluate each into a folder of its own"
@@ -247,7 +247,7 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
 
 
 def too_good(entry: Entry) -> str:
-    """Why nobody can have earned a row, "" if somebody can: it beats optima by more than its engine's difference."""
+    """Why no controller can have earned a row, "" if one can: it beats optima by more than its engine's difference."""
     of_episode, of_mean = LEAST_REGRET[entry.physics]
     regrets = [result.cost / result.optimum - 1 if result.success else 0.0 for result in entry.results()]
     worst = min(range(len(regrets)), key=regrets.__getitem__)

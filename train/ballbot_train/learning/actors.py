@@ -15,7 +15,7 @@ from ballbot_train.policy.network import PolicyNetwork
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
-the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
+the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which resolves small errors. A
 centred actor acts in the finer of these frames, and keeps the robot exactly in the steady motion of the end of an episode."""
 
 RoutedSymmetry = Literal[Symmetry, "routes"]
@@ -90,17 +90,17 @@ def actor_for(
 def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
     """A policy to start from, perhaps of another robot and its episodes, for the task, robot and history of `mine`.
 
-    What it sees or is told more it makes nothing of at first.
+    Weights of inputs that it did not have before are zero at first.
 
     Raises:
-        ValueError: it sees a longer past than `mine`, or is told more, or commands another number of motors.
+        ValueError: it sees a longer past than `mine`, or is informed and `mine` is not, or commands another number of motors.
     """
     start, informed = network.spec, network.spec.informed or mine.informed
     spec = replace(start, task=mine.task, robot=mine.robot, history=mine.history, informed=informed)
     if start.history > mine.history:
         raise ValueError(f"the policy to start from sees {start.history} earlier observations; give --history")
     if spec.informed != mine.informed:
-        raise ValueError("the policy to start from is told the robot; give --informed")
+        raise ValueError("the policy to start from is informed of its robot's parameters; give --informed")
     if (spec.actions, spec.observations) != (start.actions, start.observations):
         raise ValueError(f"a policy of {start.robot} cannot start one of {mine.robot}, which has other motors")
     made = PolicyNetwork(spec)
@@ -113,7 +113,7 @@ def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
 
 
 def average_of(actor: torch.nn.Module, updates: int) -> AveragedModel:
-    """A running average of an actor over about its last so many updates, in `module`; the first updates start it."""
+    """A running average of an actor over about its last `updates` updates, in `module`; at first, the mean of all updates."""
 
     def towards(kept: torch.Tensor, new: torch.Tensor, done: torch.Tensor | int) -> torch.Tensor:
         return kept.lerp(new, max(1 / updates, 1 / (1 + int(done))))

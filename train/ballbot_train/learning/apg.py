@@ -4,11 +4,11 @@ The gradient runs through the batched model and the policy (Freeman et al., "Bra
 draws episodes, runs them, and lowers the logarithm of their costs. There is no critic whose errors would be followed as well,
 so this takes a good policy nearer to the optimum than the other learners do.
 
-Two parts of a task have no gradient and get one here. A penalty on coming closer to a margin than `margin_clearance` stands
-for failures, and one on a ball that nearly slips where friction is limited. A first exit lies at the control step at which
-the cost so far, plus a penalty on what the state still lacks of the goal, is least, and a ball that slips goes on as if it
-gripped. An episode of full length, or with noise, pays in its last half second for what it lacks of the goal, because the
-cost hardly tells rest at the goal from rest near it.
+Two parts of a task have no gradient and get one here. Failures become a penalty on coming closer to a margin than
+`margin_clearance`, and, where friction is limited, a penalty on a ball that nearly slips. A ball that slips moves on as if it
+gripped. A first exit is taken at the control step with the least sum of the cost so far and a penalty on the distance from
+the goal. An episode of full length, or with noise, pays in its last half second for its distance from the goal, because the
+costs of rest at the goal and of rest near it are almost equal.
 """
 
 import math
@@ -68,7 +68,7 @@ TUNED: dict[str, ApgConfig] = {
 
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training, whenever it comes. It has no gradient
-_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 10000.0  # as of the margins, for `Ballbot.limits` of robots that can slip
+_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 10000.0  # same as for the margins, for `Ballbot.limits` of robots that can slip
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 _BETAS, _FINAL_LEARNING_RATE_FRACTION = (0.9, 0.99), 0.02  # of Adam; the rate falls along half a cosine
 _MAX_GRAD_NORM = 0.3  # the gradient is larger in nearly every iteration
@@ -97,7 +97,7 @@ class Apg:
         history: int = 0,
         informed: bool = False,
     ):
-        """As of `Algorithm.make`."""
+        """See `Algorithm.make`."""
         torch.manual_seed(seed)  # for the networks' first weights
         self.config, self.iteration, self._own, self._seed, self._warm = config, 0, task, seed, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
@@ -157,7 +157,7 @@ class Apg:
         start = state.x
         total = torch.zeros(config.num_envs)
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
-        standing = alive  # an episode that has reached the goal goes on for a while, and may fail then
+        standing = alive  # an episode that has reached the goal continues for a while, and may still fail
         noisy = self._batch.randomization.is_noisy
         rests = not task.first_exit and (noisy or task.steps >= self._own.steps)
         ends, patience = [], _PATIENCE
@@ -176,7 +176,7 @@ class Apg:
                 patience -= bool((reached | ~alive).all())
                 if not patience:
                     break
-            # where an episode has failed, the model goes on from its start, which leads to no infinite numbers
+            # failed episodes continue from their start states, so that no number becomes infinite
             x = torch.where(alive & standing, end, start)
             if self._batch.randomization.active and x.requires_grad:
                 x.register_hook(self._tamed)
@@ -193,8 +193,8 @@ class Apg:
         return torch.nan_to_num(slope * (most / slope.norm(dim=0)).clamp(max=1.0), 0.0, 0.0, 0.0)
 
     def _control_step(self, state: BatchState) -> tuple[torch.Tensor, ...]:
-        """One control step of every env. A ball that slips goes on as if it gripped: the penalty on slipping has a gradient
-        then.
+        """One control step of every env. A ball that slips moves on as if it gripped, so that the penalty on slipping has a
+        gradient.
 
         Returns:
             The states (8, B) at its end, its cost (B,) with the penalties on nearness to margins and on a ball that slips or

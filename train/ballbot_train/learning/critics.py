@@ -1,7 +1,7 @@
 """What a critic sees, and the value that it starts from.
 
-The value of a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, and so the robot
-rests beside the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
+The value of a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, so the robot
+would rest off the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
 """
 
 from collections.abc import Callable, Sequence
@@ -55,7 +55,7 @@ class QuadraticCritic(torch.nn.Module):
 
 
 def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:
-    """Discounted sum of scaled rewards of living for ever without cost; without a discount, for the task's duration.
+    """Discounted sum of scaled rewards of living indefinitely without cost; without a discount, for the task's duration.
 
     Critics start from it, because the values of good policies are near it and far from 0.
     """
@@ -87,7 +87,7 @@ def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: flo
 def weigh_gradients(values: Sequence[torch.Tensor], living: float) -> None:
     """Divides gradients that flow back into the values (n, 1) of several critics by the cost to go, as the lowest say it.
 
-    The mean of all n factors is 1. `living` is as of `relative_advantages`.
+    The mean of all n factors is 1. For `living` see `relative_advantages`.
     """
     if not values[0].requires_grad:
         return

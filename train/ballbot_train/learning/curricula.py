@@ -1,4 +1,4 @@
-"""Training episodes that are easier than the task, or begin where more is learnt. Evaluation is always the task itself.
+"""Training episodes that are easier than the task, or begin in more useful states. Evaluation always uses the task itself.
 
 - `short_episodes`: a share of the episodes is cut soon after its start, so that more of the samples are of starts, where most
   of a good policy's regret arises.
@@ -8,8 +8,8 @@
   - Half of the episodes begin in states along optima of training episodes, with the time that is left there: shortly before
     the end at first, and ever earlier as enough of them succeed (Florensa et al., "Reverse curriculum generation for
     reinforcement learning", 2017).
-  - A share of the episodes repeats starts from which recent ones failed or missed the goal. So what is hard is met often, as
-    the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized level replay", 2021).
+  - A share of the episodes repeats the starts of recent episodes that failed or missed the goal. So hard starts are frequent,
+    such as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized level replay", 2021).
   - Rewards are minus the cost, shaped by a potential, minus the distance to the goal. Shaping moves no optimum (Ng et al.,
     "Policy invariance under reward transformations", 1999). Living would pay for missing the goal.
   - It is over when goal and field are the task's own and enough episodes succeed. From then on a failure costs less, and
@@ -38,7 +38,7 @@ FAILURE_PRICE = 60.0
 
 _GOAL_FACTOR, _GOAL_STEP = 5.0, 0.97  # how much wider the goal begins, and the factor by which it narrows
 _RAMPS = {"max_speed": (4.05, 0.2)}  # fields that bound what is drawn: where they begin, and the step to the task's own
-_EPISODES = 256  # that end before their share of successes is looked at; then they are counted anew
+_EPISODES = 256  # episodes after which their share of successes is checked and counting restarts
 _SUCCESS = 0.75  # share of them that is enough for a step
 _SETTLED_SUCCESS = 0.85  # of the task's own episodes, for the curriculum to be over
 _ON_OPTIMA = 0.5  # share of the episodes that begins on optima, while the goal is wider or the field another
@@ -46,9 +46,9 @@ _OPTIMA = 200
 _OPTIMA_SUCCESS = 0.6  # share of those episodes that has to succeed too before the goal narrows
 _RESERVE = 0.4  # share of the goal's tolerances that optima leave unused: noise must be allowed where slow ones end
 _REACH, _REACH_STEP = 0.1, 0.15  # s: how long before the end of their optimum they begin, and how much earlier then
-_RETRIES, _RETRIES_PER_FAILURE = 0.4, 10.0  # share that repeats starts; later so many times the share that goes wrong
+_RETRIES, _RETRIES_PER_FAILURE = 0.4, 10.0  # share that repeats starts; later a multiple of the share that goes wrong
 _SHAPING = 10.0  # 1/m
-_EARLY_FAILURE_PRICE = 300.0  # while the curriculum lasts: it teaches not to fail; beside a low one cost is learnt
+_EARLY_FAILURE_PRICE = 300.0  # while the curriculum lasts: it teaches not to fail; a low price teaches a low cost
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
 _STATE = (
@@ -86,14 +86,14 @@ class CurriculumBatch(BallbotBatch):
             short_episodes: share of the episodes that is cut, and how long these last, s.
             backwards: whether training goes from the goal backwards.
             pay: whether living pays; else, and backwards, the reward is minus the running cost, and a failure has a price.
-            world: randomization and history, as of `BallbotBatch`.
+            world: randomization and history, see `BallbotBatch`.
 
         Raises:
             ValueError: the task has not what this asks for.
         """
         distance = task.goal_distance((0.0,) * 8, (1.0,) * len(task.constant_names))
         if backwards and (not task.first_exit or distance is None):
-            raise ValueError(f"{task.id} cannot be learnt backwards: it needs first_exit and goal_distance")
+            raise ValueError(f"{task.id} cannot be learned backwards: it needs first_exit and goal_distance")
         if not (0 <= short_episodes[0] <= 1 and short_episodes[1] > 0):
             raise ValueError(f"short_episodes must be a share of 0 to 1 and seconds above 0, not {short_episodes}")
         if short_episodes[0] and task.first_exit:
@@ -132,7 +132,7 @@ class CurriculumBatch(BallbotBatch):
         return not self._is_easier and self._has_settled
 
     def reset(self, *args: Any, mask: torch.Tensor | None = None, **given: Any) -> torch.Tensor:
-        """As of `BallbotBatch`: these episodes begin as the task's own do."""
+        """Same as in `BallbotBatch`: these episodes begin as the task's own do."""
         observation = super().reset(*args, mask=mask, **given)
         begun = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
         self._kind = torch.where(begun, _OWN, self._kind)
@@ -142,7 +142,7 @@ class CurriculumBatch(BallbotBatch):
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> BatchStep:
-        """As of `BallbotBatch`, with the rewards and the next episodes of training. It carries no gradients."""
+        """Same as in `BallbotBatch`, with the rewards and the next episodes of training. It carries no gradients."""
         before, task = self.state, self.task
         result = super().step(actions)
         assert before is not None  # else the step above raises
@@ -155,7 +155,7 @@ class CurriculumBatch(BallbotBatch):
                 reward = reward - survive * (task.steps - before.steps - 1) * result.success
         if self.backwards:
             start, end = (self._potential(x, before.c) for x in (before.x, result.final_x))
-            # An episode that terminates ends with a potential of 0, and a truncated one goes on.
+            # An episode that terminates ends with a potential of 0; a truncated one keeps its own.
             reward = reward + self.gamma * torch.where(result.terminated, 0.0, end) - start
         ended = result.terminated | result.truncated
         if self.backwards:
@@ -264,7 +264,7 @@ class CurriculumBatch(BallbotBatch):
             self._hard[kind] = torch.cat([self._hard[kind], starts], 1)[:, -_KEPT_STARTS:]
 
     def _retry(self, ended: torch.Tensor) -> None:
-        """Moves a share of the episodes that have just begun to starts from which others of their kind went wrong."""
+        """Moves a share of the episodes that have just begun to the starts of others of their kind that went wrong."""
         drawn = ended & (torch.rand(self.num_envs) < self._retried_share)
         for kind, hard in enumerate(self._hard):
             again = drawn & (self._kind == kind)

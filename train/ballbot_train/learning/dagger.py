@@ -1,9 +1,9 @@
 """DAgger with the optimum as the expert: every state that the learner reaches is labelled with the optimal action there.
 
 The first iterations gather samples. Each of them draws episodes and finds their optima, thousands at once where that is
-possible. Half of the episodes then follow the expert, with noise, and half the learner. In a state that each of them came to
-the optimum is searched anew, and they run again from there (Ross et al., "A reduction of imitation learning and structured
-prediction to no-regret online learning", 2011, with the mixture β of expert and learner drawn per episode).
+possible. Half of the episodes then follow the expert, with noise, and half the learner. From one state of each of them the
+optimum is searched again, and the episode runs again from there (Ross et al., "A reduction of imitation learning and
+structured prediction to no-regret online learning", 2011, with the mixture β of expert and learner drawn per episode).
 
 The feedback about an optimum is the derivative of the optimal force with respect to the state. So it labels every state that
 an episode comes to, as long as that lies near its optimum. Errors are weighted by one over the cost of the episode's optimum,
@@ -84,7 +84,7 @@ _NOISE, _NOISE_IN_GRIP = 0.2, 0.05
 _STATES = 32  # of each optimum that become samples, on average
 _SMALL = 0.3  # of the force limit: a derivative is no guide to greater changes
 _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
-# by which distances in a state are told, in SI units
+# the scale of a distance in each component of a state, SI units
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
 _HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
@@ -144,7 +144,7 @@ class Dagger:
         randomization: Randomization | None = None,
         history: int = 0,
     ):
-        """As of `Algorithm.make`. Demonstrations are its first samples."""
+        """See `Algorithm.make`. Demonstrations are its first samples."""
         on_track, robot = randomization is not None or history > 0, registered_name(params)
         samples = _first_samples(demos, task, robot, config, on_track)
         self.config, self.iteration, self._warm = config, 0, start is not None

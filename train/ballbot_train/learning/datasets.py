@@ -92,7 +92,7 @@ def load_demos(path: str | Path, task: Task, robot: str = PAPER) -> Demos:
         arrays = _sharded(path) if shards.is_set(path) else _dataset(Path(path))
         return _demos(arrays, len(task.observation_scale))
     except Exception as error:  # h5py has dozens of ways to refuse a damaged file
-        raise ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})') from error
+        raise ValueError(f'{path} is damaged; record it again with "ballbot demos" ({error!r:.300})') from error
 
 
 def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task, robot: str) -> None:
@@ -109,7 +109,7 @@ def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task, robot: s
     if metadata.get("observation_version") != OBSERVATION_VERSION:
         raise ValueError(
             f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "
-            'make it anew with "ballbot demos"'
+            'record it again with "ballbot demos"'
         )
 
 
@@ -142,7 +142,7 @@ def _dataset(path: Path) -> dict[str, np.ndarray]:
 
 
 def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:
-    """The demonstrations of a shard's arrays, with so many observations.
+    """The demonstrations of a shard's arrays; `observations` is the size of an observation.
 
     Raises:
         KeyError, ValueError, IndexError, TypeError: they do not fit together, or one holds something else than numbers.
@@ -170,7 +170,7 @@ def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:
 
 
 def command_of(path: str | Path) -> str:
-    """The command that makes a dataset of `ballbot demos` anew.
+    """The command that records a dataset of `ballbot demos` again.
 
     Raises:
         ValueError: it is no such dataset.

@@ -1,8 +1,8 @@
 """Demonstrations: episodes of an expert with exploration, as Minari datasets.
 
 In every control step the expert is asked for its action, and the robot executes this action plus noise. Sometimes a push, a
-random force for one control step, replaces the action. The expert then plans anew from the state after the push. So the
-dataset shows recoveries too.
+random force for one control step, replaces the action. The expert then plans again from the state after the push. So the
+dataset contains recoveries too.
 
 | in the dataset | is |
 |---|---|
@@ -13,7 +13,7 @@ dataset shows recoveries too.
 
 `plans` counts the expert's plans, and `plans_failed` its searches that found none.
 
-`load_demos` reads a dataset for learners. `write_shards` makes shards in place of a dataset.
+`load_demos` reads a dataset for learners. `write_shards` makes shards instead of a dataset.
 """
 
 import importlib.metadata
@@ -101,7 +101,7 @@ class DemoConfig:
 
 
 class Expert:
-    """A controller as a teacher: it gives its action in states of an episode that others control, and replans if told to."""
+    """A controller as a teacher: it gives its action in states of an episode that others control, and replans on request."""
 
     def __init__(self, name: str, task: Task, params: Robot, backoff: Backoff = EXECUTED):
         """Args: name: as in `DemoConfig`; backoff: given to a controller whose constructor takes one."""
@@ -118,7 +118,7 @@ class Expert:
         self.plans, self.plans_failed = 1, 0
 
     def replan(self, t: float, x: np.ndarray) -> None:
-        """Plans anew from state x (8,); keeps the old plan if there is no new one. Experts without plans do nothing."""
+        """Plans again from state x (8,); keeps the old plan if there is no new one. Experts without plans do nothing."""
         controller = self._controller
         if not hasattr(controller, "plan"):
             return

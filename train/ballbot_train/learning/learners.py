@@ -73,7 +73,7 @@ class Algorithm:
         history: int = 0,
         informed: bool = False,
     ) -> None:
-        """Raises a ValueError where the learner does not support what is asked of it; arguments as of `make`."""
+        """Raises a ValueError if the learner does not support what is asked of it; for the arguments see `make`."""
         wanted = {
             "demonstrations": demos is not None,
             "start": start is not None,
@@ -107,7 +107,7 @@ class Algorithm:
         Args:
             task: to learn.
             params: the robot.
-            settings: as of `settings`.
+            settings: see `settings`.
             seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
             start: a policy to train on from, or None; it may be of another robot.

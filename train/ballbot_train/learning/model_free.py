@@ -94,7 +94,7 @@ class ModelFree(ABC):
     On a task that ends at its goal, after a warm start or backwards, the reward is minus the cost: living would pay for
     missing the goal.
 
-    A resumed run does exactly what it would have done; only the success rate of the last hundred episodes starts anew.
+    A resumed run does exactly what it would have done; only the success rate of the last hundred episodes restarts.
     """
 
     _imitation_weight: float
@@ -117,8 +117,8 @@ class ModelFree(ABC):
         warm: whether training starts from them or from a policy.
         frame: in which the envs show observations and take actions; demos must be of it already.
         control_dt: how long each force is held in training, s; default, as in the task.
-        backwards: as of `CurriculumBatch`.
-        world: randomization and history, as of `BallbotBatch`.
+        backwards: see `CurriculumBatch`.
+        world: randomization and history, see `BallbotBatch`.
 
         Raises:
             ValueError: the task does not have what the settings ask for, or a discount factor is none.
@@ -187,7 +187,7 @@ class ModelFree(ABC):
         return gamma ** (self._trained.control_dt / self._task.control_dt)
 
     def _value_of_living(self, gamma: float) -> float:
-        """Value of living for ever without cost."""
+        """Value of living indefinitely without cost."""
         return value_of_living(self._trained, self._reward_scale, gamma) if self._pay else 0.0
 
     def _weigh(self, _critics: nn.Module, _inputs: Any, values: Any) -> None:
@@ -206,7 +206,7 @@ class ModelFree(ABC):
         """The mean actions (n, 2) of the actor for observations (n, no), both as the envs show them."""
 
     def _raise_gamma(self, gamma: float) -> None:
-        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
+        """Sets the discount factor, and moves all values by the change of the value of living indefinitely."""
         more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
         with torch.no_grad():
             for bias in self._value_biases:
@@ -228,7 +228,7 @@ class ModelFree(ABC):
         return self._env.batch.difficulty
 
     def iterate(self) -> dict[str, float]:
-        # Stable-Baselines3 draws from the global generators, from which others may have drawn since the last iteration
+        # Stable-Baselines3 uses the global generators, and others may have used them since the last iteration
         torch.set_rng_state(self._random["torch"])
         np.random.set_state(self._random["numpy"])
         figures = self._clone() if self.iteration < self._clone_iterations else self._improve()
@@ -265,8 +265,8 @@ class ModelFree(ABC):
 
     @property
     def _progress(self) -> float:
-        """Share of their course that the schedules are through. Backwards, they wait until the task is its own: what is
-        learnt until then needs the noise of before.
+        """Share of their course that the schedules are through. Backwards, they wait until the curriculum is over, because
+        learning needs the initial noise until then.
         """
         if not self._env.batch.backwards:
             return self._share_done

@@ -138,7 +138,7 @@ class _RelativeRollouts(RolloutBuffer):
     """A rollout buffer of advantages relative to the cost to go."""
 
     def __init__(self, *args: Any, living: Callable[[float], float], **kwargs: Any):
-        """Args: living: from a discount factor to the value of living for ever without cost; the others are SB3's."""
+        """Args: living: from a discount factor to the value of living indefinitely without cost; the others are SB3's."""
         self._living = living
         super().__init__(*args, **kwargs)
 
@@ -215,7 +215,7 @@ class Ppo(ModelFree):
         start: PolicyNetwork | None = None,
         **world: Any,
     ):
-        """As of `Algorithm.make`. A policy to start from says the shape of the actor."""
+        """See `Algorithm.make`. A policy to start from decides the shape of the actor."""
         warm = demos is not None or start is not None
         if warm and config.backwards:
             raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")

@@ -86,7 +86,7 @@ TUNED: dict[str, SacConfig] = {
 """From scratch by name of task; "" is any other.
 
 Targets look 0.4 s ahead, in steps that the present policy took. With one step of 0.02 s the critics' errors are larger than
-what an action changes, and SAC forgot what it had learnt.
+what an action changes, and SAC forgot what it had learned.
 """
 
 _WARM = replace(
@@ -183,7 +183,7 @@ _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", 
 
 
 def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
-    """Demonstrations with features in place of observations, and actions as the frame has them."""
+    """Demonstrations with features instead of observations, and with actions in the frame."""
     observations, axes = seen_in(frame, demos.observations)
     next_observations, _ = seen_in(frame, demos.next_observations)
     turned = {
@@ -197,7 +197,7 @@ class _OwnActor(Actor):
     """SB3's actor as a policy network, whose mean actions may be centred."""
 
     def __init__(self, *args: Any, network: PolicyNetwork, **kwargs: Any):
-        """Args: network: it gets SB3's layers in place of its own; the others are SB3's."""
+        """Args: network: it gets SB3's layers instead of its own; the others are SB3's."""
         super().__init__(*args, **kwargs)
         network.mlp = torch.nn.Sequential(*self.latent_pi, self.mu)
         self.network = network
@@ -259,7 +259,7 @@ class Sac(ModelFree):
         demos: str | Path | None = None,
         start: PolicyNetwork | None = None,
     ):
-        """As of `Algorithm.make`. Demonstrations are kept beside its own steps, and a policy must be one of SAC's."""
+        """See `Algorithm.make`. Demonstrations are stored along with its own steps, and a policy must be one of SAC's."""
         if demos is not None and config.n_steps > 1:
             raise ValueError("n_steps must be 1 with demonstrations, which are single steps")
         spec = spec_for(task, config.symmetry, config.hidden, robot=registered_name(params))

@@ -26,7 +26,7 @@ class BallbotVecEnv(VecEnv):
     | TimeLimit.truncated | the episode ran out of time, so learners bootstrap from the value of that observation |
     | is_success | the task's goal held at the end; logged as `rollout/success_rate` |
     | failure | a limit was violated |
-    | episode | the return r, the length l in control steps and the seconds t since this object was made, as of `Monitor` |
+    | episode | the return r, the length l in control steps and the seconds t since this object was created, as in `Monitor` |
 
     A `VecMonitor` is not needed. `gymnasium.make_vec(..., max_episode_steps=100)` limits episodes.
     """

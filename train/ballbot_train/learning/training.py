@@ -89,7 +89,7 @@ class Learner(Protocol):
 
     @property
     def network(self) -> PolicyNetwork:
-        """The policy learnt so far."""
+        """The policy learned so far."""
         ...
 
     def iterate(self) -> dict[str, float]:
@@ -129,7 +129,7 @@ def score_and_validate(
     | certified/regret_mean, regret_median, regret_worst | of cost / optimum − 1 of the episodes that did not fail |
     | certified/success, failures | share of the episodes that ended in success, and number of those that failed |
     | validation/cost | mean cost; an episode without success costs at least as much as failing at once |
-    | validation/mean_cost | mean cost as it is, which tells near misses apart where no episode succeeds |
+    | validation/mean_cost | mean cost as it is, which ranks near misses where no episode succeeds |
     | validation/success, failures | as on the certified episodes |
     """
     known = certified.load(task, robot, randomization=randomization)

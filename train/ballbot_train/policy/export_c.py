@@ -167,5 +167,5 @@ def _test(network: PolicyNetwork, task: Task, robot: str, filtered: bool) -> dic
     controller.reset(0.0, shown[0], c)
     actions = np.array([controller.act(float(t), x) for t, x in zip(times, shown, strict=True)]) / params.force_limit
     if not np.isfinite(actions).all():
-        raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
+        raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it again")
     return arrays | {"constants": c if c.size else np.zeros(1), "times": times, "actions": actions.clip(-1, 1)}

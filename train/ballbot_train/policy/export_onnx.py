@@ -137,7 +137,7 @@ def _check(model: Any, network: PolicyNetwork) -> None:
     with torch.inference_mode():
         expected = network(torch.as_tensor(observations)).numpy()
     if not np.isfinite(expected).all():
-        raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
+        raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it again")
     error = float(np.abs(found - expected).max())
     if not error < _LARGEST_ERROR:
         raise RuntimeError(f"the ONNX graph's actions differ from the policy's by {error:g}: not written")

@@ -82,8 +82,8 @@ class PolicySpec:
     history: int = 0
     """How many earlier observations and actions it sees; `history` of its env."""
     informed: bool = False
-    """Whether it is told the robot, what `ROBOT_FACTORS` names, behind the observation. It runs behind a filter, which finds
-    that out, as in Yu et al., "Preparing for the unknown" (2017)."""
+    """Whether the robot's parameters (`ROBOT_FACTORS`) are appended to the observation. The policy runs behind a filter that
+    estimates them, as in Yu et al., "Preparing for the unknown" (2017)."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.task, str):
@@ -96,7 +96,7 @@ class PolicySpec:
             _check_count(name, getattr(self, name))
         check_history(self.history)
         if self.history and (self.routes or self.informed):
-            raise ValueError("routes and informed policies know no history")
+            raise ValueError("policies with routes and informed policies do not support a history; set history to 0")
         for name in ("hidden", "routes"):
             layers = getattr(self, name)
             if not isinstance(layers, tuple) or len(layers) > _MOST_LAYERS:
@@ -143,13 +143,13 @@ class PolicySpec:
 
     @property
     def seen(self) -> int:
-        """Numbers that the policy takes: an observation, and behind it the past, or what it is told of the robot."""
-        told = len(ROBOT_FACTORS) if self.informed else 0
-        return self.observations + self.history * (self.observations + self.actions) + told
+        """Numbers that the policy takes: an observation, followed by the past or by the robot's parameters."""
+        parameters = len(ROBOT_FACTORS) if self.informed else 0
+        return self.observations + self.history * (self.observations + self.actions) + parameters
 
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":
-        """The spec that a policy's JSON file describes, where JSON has lists in place of tuples.
+        """The spec that a policy's JSON file describes. JSON has lists instead of tuples.
 
         Raises:
             KeyError, TypeError, ValueError: it describes none.
@@ -207,12 +207,12 @@ def read_description(path: str | Path) -> dict[str, Any]:
 
 
 def way_of(path: str | Path) -> str:
-    """The whole way of a policy as its record tells it: all learners and demonstrators in turn, as "dagger → shac".
+    """The whole way of a policy by the record in its file: all learners and demonstrators in turn, as "dagger → shac".
 
     "" where the record holds no command of `ballbot train`.
     """
     training = read_description(path).get("training", {})
-    # "command" makes the policy anew by today's options; "made_by" is what made it, where that differs
+    # "command" trains the policy again by today's options; "made_by" is the original command, if that differs
     command = str(training.get("made_by") or training.get("command"))
     names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
     return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ballbot_gym.batch import BatchState
 
 _TOLD = len(ROBOT_FACTORS)
-_TOLD_SCALE = 0.3  # of what informed policies are told, less 1
+_TOLD_SCALE = 0.3  # of the robot's parameters minus 1, as inputs of informed policies
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
 
 
@@ -49,21 +49,24 @@ class PolicyNetwork(torch.nn.Module):
 
     Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit; with wheels (..., 3).
     With a frame, o and the action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so
-    it mirrors exactly. A centred policy takes from the sum what it is in the steady motion in which the episode shall end,
-    and adds the action that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a
-    network of its own decides on which sides obstacles are passed.
+    it mirrors exactly. A centred policy subtracts from the sum its value in the steady motion at the end of the episode,
+    and adds the action that keeps this motion. So it rests exactly at its goal, or orbits exactly on the circle. With routes,
+    a network of its own decides on which sides obstacles are passed.
 
-    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in. An
-    informed policy takes what it is told of the robot behind the observation, and its forces are those of the nominal motors.
+    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in. The
+    observations of an informed policy end with the robot's parameters, and its forces are those of the nominal motors.
     """
 
     def __init__(self, spec: PolicySpec, device: str = "cpu"):
         super().__init__()
         self.spec = spec
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
-        told, none = [1] * _TOLD * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
+        unchanged, none = [1] * _TOLD * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
         self._mirrors = [
-            (torch.tensor([*signs, *(spec.history * (*signs, *action)), *told], **own), torch.tensor(action, **own))
+            (
+                torch.tensor([*signs, *(spec.history * (*signs, *action)), *unchanged], **own),
+                torch.tensor(action, **own),
+            )
             for signs, action in (*spec.mirrors, *[none] * (spec.odd and spec.informed))
         ]
         self._frame = spec.seen_in
@@ -90,32 +93,33 @@ class PolicyNetwork(torch.nn.Module):
         return torch.tanh(raw) if self.spec.squash == "tanh" else raw.clamp(-1.0, 1.0)
 
     def knowing(self, observation: torch.Tensor, state: "BatchState", track: Randomization) -> torch.Tensor:
-        """Actions (B, 2) for observations (B, no) without what an informed policy is told of the robots. That is what `track`
-        drew for them, as a filter tells it: in the first control step, when nothing is known yet, what is drawn on average.
+        """Actions (B, 2) for observations (B, no) without the robots' parameters, which an informed policy needs.
+
+        As behind a filter it gets their mean over the track in the first control step, and afterwards those that were drawn.
         """
         if not self.spec.informed:
             return self(observation)
-        told = state.drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T.to(observation.dtype)
-        expected = told.new_tensor([sum(getattr(track, name)) / 2 for name in ROBOT_FACTORS])
-        told = torch.where(state.steps[:, None] == 0, expected, told)
-        return self(torch.cat([observation, told], -1)) / told[:, -1:]
+        drawn = state.drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T.to(observation.dtype)
+        expected = drawn.new_tensor([sum(getattr(track, name)) / 2 for name in ROBOT_FACTORS])
+        estimates = torch.where(state.steps[:, None] == 0, expected, drawn)
+        return self(torch.cat([observation, estimates], -1)) / estimates[:, -1:]
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
-        told = observation[..., :0]
+        estimates = observation[..., :0]
         if self.spec.informed:
-            observation, told = observation[..., :-_TOLD], (observation[..., -_TOLD:] - 1.0) / _TOLD_SCALE
+            observation, estimates = observation[..., :-_TOLD], (observation[..., -_TOLD:] - 1.0) / _TOLD_SCALE
         if self._frame is not None:
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             plain = observation.ndim == 1 and torch.is_inference_mode_enabled()
             features, back = self.features(self._seen(observation, plain))
-            features = (*features, *(told.tolist() if plain else told.unbind(-1)))
+            features = (*features, *(estimates.tolist() if plain else estimates.unbind(-1)))
             action = self.centred(self._sum(stacked(features, observation)), features)
             if self.spec.squash == "tanh_in_frame":
                 action = REACH * torch.tanh(action)
             return stacked(back(tuple(action.tolist()) if plain else action.unbind(-1)), observation)
         if self.spec.informed:
-            observation = torch.cat([observation, told], -1)
+            observation = torch.cat([observation, estimates], -1)
         total = self._sum(observation)
         for signs, action_signs in self._mirrors:
             total = total + action_signs * self._sum(signs * observation)
@@ -165,12 +169,12 @@ class PolicyNetwork(torch.nn.Module):
         return output + needed
 
     def kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
-        """Features of the steady motion, as if it had gone on for all of the history, and the action that keeps it."""
+        """Features of the steady motion, as if it had lasted for the whole history, and the action that keeps it."""
         assert self._frame is not None
         assert self._frame.steady is not None
         kept, action = self._frame.steady(features[: self.present])
-        told = features[self.present :] if self.spec.informed else ()
-        return (*kept, *(self.spec.history * (*kept, *action)), *told), action
+        estimates = features[self.present :] if self.spec.informed else ()
+        return (*kept, *(self.spec.history * (*kept, *action)), *estimates), action
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
@@ -292,7 +296,7 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
     if spec.observation_version != OBSERVATION_VERSION:
         raise PolicyError(
             f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
-            "train it anew"
+            "train it again"
         )
     _check_content(description_path, spec, task)
     observations = task.observation_size(named_robot(spec.robot))

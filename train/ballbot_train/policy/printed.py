@@ -42,8 +42,8 @@ _SHARED = {
 def policy_function(network: PolicyNetwork) -> Callable[[casadi.SX], casadi.SX]:
     """What a policy computes around its networks, of what it sees: its actions (2,) in [−1, 1], with wheels (3,).
 
-    The networks are calls, from arrays to arrays: `networks[0]` is the sum of the network and the linear part, and
-    `networks[1]` tells 1 or −1 for every obstacle that is passed on its nearer or farther side from the layout of all.
+    The networks are calls, from arrays to arrays. `networks[0]` is the sum of the network and the linear part. `networks[1]`
+    maps the layout of all obstacles to 1 for each one that is passed on its nearer side, and to −1 for the others.
     """
     spec, split = network.spec, casadi.vertsplit
     reach = REACH if spec.squash == "tanh_in_frame" else 1.0
@@ -82,7 +82,7 @@ def policy_function(network: PolicyNetwork) -> Callable[[casadi.SX], casadi.SX]:
 
 
 def _network(i: int, inputs: casadi.SX, outputs: int) -> casadi.SX:
-    """A call that is printed as that of `networks[i]`, which is told by an argument."""
+    """A call that is printed as that of `networks[i]`. An argument holds i."""
     arguments = [casadi.SX.sym("i"), casadi.SX.sym("inputs", inputs.numel())]
     call = casadi.Function("network", arguments, [casadi.SX.zeros(outputs)], {"never_inline": True})
     return call(i, inputs)
@@ -174,7 +174,7 @@ _C_IN_DOUBLE = _Language(str, _number, "const double {0} = {1};")
 def _printed(
     name: str, function: Callable[..., Any], arguments: Mapping[str, int], language: _Language
 ) -> tuple[list[str], list[str]]:
-    """The lines of a function, named for errors, and its results; arguments as of `javascript_function`."""
+    """The lines of a function, named for errors, and its results; for the arguments see `javascript_function`."""
     inputs = [casadi.SX.sym(argument, size) for argument, size in arguments.items()]
     found = function(*inputs)
     parts = found if isinstance(found, tuple) else (found,)

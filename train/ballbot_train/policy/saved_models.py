@@ -222,7 +222,7 @@ def _read_zip(path: Path) -> _Saved:
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:
-    """A space from the words that stand beside its pickled form, which is not read."""
+    """A space from its text form. The pickled form is not read."""
     kind = str(described[":type:"])
     if not kind.endswith(".box.Box'>"):
         return kind

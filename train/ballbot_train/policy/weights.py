@@ -106,11 +106,11 @@ def checked(weights: Mapping[str, Any], path: str | Path) -> dict[str, torch.Ten
     for name, tensor in found.items():
         if not tensor.isfinite().all():
             raise PolicyError(
-                f"{path}: {name:.100} holds NaN or infinity; take an earlier policy of the training, or train anew"
+                f"{path}: {name:.100} holds NaN or infinity; take an earlier policy of the training, or train again"
             )
         if (tensor.abs() > _LARGEST).any():
             raise PolicyError(
                 f"{path}: {name:.100} holds numbers beyond ±{_LARGEST:g}; take an earlier policy of the training, or train "
-                "anew"
+                "again"
             )
     return found

@@ -135,7 +135,7 @@ def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = 
 
     Regret, with its 95 % interval, is drawn where at least half of the episodes did not fail.
     """
-    stresses = list(dict.fromkeys(row.told["stress"] for row in rows if row.told["stress"] != NONE))
+    stresses = list(dict.fromkeys(row.labels["stress"] for row in rows if row.labels["stress"] != NONE))
     named = labels((row.controller for row in rows if row.task == task), ways_on(ways, task))
     figure = Figure(figsize=(2.9 * len(stresses), 5.6), layout="constrained")
     axes = figure.subplots(2, len(stresses), squeeze=False, sharey="row", sharex="col")
@@ -144,11 +144,11 @@ def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = 
         above, below = axes[:, i]
         for k, controller in enumerate(named):
             points = curve_of(rows, task, controller, stress)
-            levels, shade, width = [row.told["level"] for row in points], color(controller, k), max(1.5, 3.5 - k)
+            levels, shade, width = [row.labels["level"] for row in points], color(controller, k), max(1.5, 3.5 - k)
             success = [100 * row.success for row in points]
             above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=named[controller])
             standing = [row for row in points if 2 * row.falls <= row.episodes and math.isfinite(row.regret_mean)]
-            levels = [row.told["level"] for row in standing]
+            levels = [row.labels["level"] for row in standing]
             below.plot(levels, [100 * row.regret_mean for row in standing], "o-", ms=4, lw=width, color=shade)
             low, high = ([100 * getattr(row, f"regret_{end}") for row in standing] for end in ("low", "high"))
             below.fill_between(levels, low, high, color=shade, alpha=0.15, lw=0)
@@ -165,7 +165,7 @@ def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = 
 
 
 def basin_figure(maps: Sequence[BasinMap], ways: Mapping[str, str] = {}) -> Figure:
-    """The initial states from which each controller recovers, coloured, on those that the robot's limits allow, grey."""
+    """The initial states that each controller brings to rest, coloured, on those that the robot's limits allow, grey."""
     controllers, named = list(maps[0].recovered), labels(maps[0].recovered, ways_on(ways, "stabilize"))
     size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
     figure = Figure(figsize=size, layout="constrained")

@@ -79,7 +79,7 @@ def film_frames(replay: Replay, times: Sequence[float] | np.ndarray, width: int 
 
 
 def _frame(replay: Replay, t: float, width: int, height: int, line: int, columns: int) -> np.ndarray:
-    """(height, width, 3) the takes at time t, s, in so many columns, with words of the height `line`, px."""
+    """(height, width, 3) the takes at time t, s, in `columns` columns, with text of the height `line`, px."""
     font, large = (ImageFont.truetype(_FONT, size) for size in (line, 3 * line // 2))
     wide, high = width // columns, (height - 2 * line) // math.ceil(len(replay.takes) / columns)
     letters = max(5, round(1.5 * wide / line))  # that fit into a line

@@ -72,7 +72,7 @@ class Workers:
 
 
 Task = tuple[Key, Callable[..., Any], tuple[Any, ...]]
-"""What tells a task from others, and a function of a module with its arguments."""
+"""The key that identifies a task, and a function of a module with its arguments."""
 
 
 def completed(tasks: Iterable[Task[Key]], workers: int | Workers) -> Iterator[tuple[Key, Any]]:
@@ -180,7 +180,7 @@ def _prepare() -> None:
 
 
 def _end_with_the_run() -> None:
-    """Ends this worker as soon as the run is killed. Else it would finish its task, which can take minutes, for nobody."""
+    """Ends this worker as soon as the run is killed. Otherwise it would spend minutes on a result that nothing reads."""
     run = parent_process()
     if run is not None:
         wait_for([run.sentinel])

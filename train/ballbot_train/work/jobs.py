@@ -55,7 +55,7 @@ class Job:
     """
 
     name: str
-    """What tells it from the other jobs of a run; its file is named after it."""
+    """Unique among the jobs of a run; its file is named after it."""
     function: Callable[..., Iterator[Entry]]
     """Called as function(*arguments, items), perhaps elsewhere: a function of a module. Yields one entry per item."""
     arguments: tuple[Any, ...]
@@ -97,7 +97,7 @@ def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Map
         out: the folder; made if missing.
         config: what decides the results; anything that JSON holds.
         marker: name of the file in the folder that keeps the configuration.
-        facts: written beside the configuration, and not compared.
+        facts: written along with the configuration, and not compared.
 
     Raises:
         ValueError: the folder belongs to another configuration, another process is using it, or its marker is damaged.
@@ -180,7 +180,7 @@ def unlock(out: Path) -> None:
     """Lets other processes use a folder; its configuration stays. Without effect where this process holds no lock."""
     lock = _held.pop(out.resolve(), None)
     if lock is not None:
-        Path(lock.lock_file).unlink(missing_ok=True)  # while it is held, so that nobody else's is deleted
+        Path(lock.lock_file).unlink(missing_ok=True)  # while it is held, so that no other run's lock is deleted
         lock.release()
 
 
@@ -207,7 +207,7 @@ def _lock(out: Path) -> None:
 def run(
     jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None] | None = None
 ) -> list[list[Entry]]:
-    """Does what is not done yet. The calling process writes every result when it comes, whoever computed it.
+    """Does the jobs that are not done yet. The calling process writes every result as it arrives.
 
     Args:
         jobs: what there is to do.

@@ -7,8 +7,8 @@ A set is a folder of this machine, or of storage that fsspec knows: runs/set, s3
 | shard-000000.npz, … | the arrays of some hundred episodes, one after another |
 | manifest.json | what the set was made from, and of every finished shard its file, episodes, bytes and SHA-256 |
 
-The manifest names a shard after its file is there. So whoever reads the manifest finds whole shards only, and a run that was
-killed makes those that it does not name. A reader holds one shard in memory, and checks its digest.
+The manifest names a shard after its file is there. So the manifest lists complete shards only, and a resumed
+run makes the others. A reader holds one shard in memory, and checks its digest.
 """
 
 import hashlib
@@ -76,7 +76,7 @@ class Shards:
                     raise ValueError(f"shard {i:.20} of {known['episodes']} episodes, and at most {_MOST} are possible")
                 self._shards[int(i)] = shard | known
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise files.FileError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
+            raise files.FileError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set again") from error
 
     @property
     def numbers(self) -> list[int]:
@@ -89,7 +89,7 @@ class Shards:
         return sum(shard["episodes"] for shard in self._shards.values())
 
     def has(self, number: int, episodes: int) -> bool:
-        """Whether a shard is finished, with so many episodes."""
+        """Whether a shard is finished, with this number of episodes."""
         return number in self._shards and self._shards[number]["episodes"] == episodes
 
     def read(self, number: int) -> dict[str, np.ndarray]:
@@ -104,7 +104,7 @@ class Shards:
         except (OSError, files.FileError) as error:
             raise files.FileError(f"{path} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != self._shards[number]["sha256"]:
-            raise files.FileError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
+            raise files.FileError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set again")
         return files.read_npz(path, min(_LIMIT, _DENSEST * len(content)), content)
 
     def _content(self, name: str, limit: int) -> bytes:
@@ -144,7 +144,7 @@ def _place_of(url: str) -> tuple[Any, str]:
 
     Raises:
         ValueError: the URL is not one of storage.
-        ImportError, OSError: as of fsspec.
+        ImportError, OSError: raised by fsspec.
     """
     scheme, address, path = url.partition("://")
     if not address:
