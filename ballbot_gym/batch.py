@@ -41,11 +41,11 @@ with imports_of("a batch of environments", "train"):
 _log = logging.getLogger(__name__)
 
 COMPILE_FROM = 1024
-"""Batch size from which compile="auto" compiles. For smaller batches half a minute of compiling seldom pays."""
+"""Batch size from which compile="auto" compiles. Compiling takes half a minute, which seldom pays off for smaller batches."""
 
-# By default a loop holds at most 64 operations, and results pass from one loop to the next through memory. And by default the
-# compiler writes an operation anew into each that reads its result: within one loop it keeps the result anyway, and
-# compiling takes twice as long.
+# By default a loop holds at most 64 operations, and results pass from one loop to the next through memory. By default the
+# compiler also repeats an operation in every operation that reads its result. Within one loop the result is kept in any
+# case, so the repetition only doubles the time of compiling.
 COMPILE_OPTIONS: dict[str, Any] = {
     "max_fusion_size": 1000,
     "realize_opcount_threshold": 2,
@@ -136,7 +136,7 @@ class BallbotBatch:
             params: the nominal robot as a Robot; the same as robot.
             randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a Robot.
-            history, observation: as of `BallbotEnv`.
+            history, observation: same as in `BallbotEnv`.
             **task_fields: fields of the task that replace its defaults.
 
         Raises:

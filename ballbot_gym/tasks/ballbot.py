@@ -55,7 +55,7 @@ class BallbotTask(Task):
 
     @abstractmethod
     def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[np.ndarray]:
-        """Ground paths from state x from which optimizers start, one per basin worth trying, the likeliest first.
+        """Ground paths from state x as initial guesses of optimizers, one per basin worth trying, the likeliest first.
 
         Each is (n+1, 2), m, one ball position per control step: n = `steps`, or less for first-exit tasks.
         """

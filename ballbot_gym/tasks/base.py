@@ -21,7 +21,7 @@ class Reference:
     """A steady motion that linear control tracks, one point per control step: x (n, 8) and u (n, 2).
 
     An open reference is tracked in time, and after its end its last point. A single point is an equilibrium. A closed
-    reference repeats for ever, and a controller may begin at any of its points.
+    reference repeats indefinitely, and a controller may start at any of its points.
     """
 
     x: np.ndarray
@@ -33,11 +33,10 @@ class Reference:
 class Task(ABC):
     """A finite-horizon optimal-control problem, and the rewards that follow from it.
 
-    Staying alive pays and motion costs: the reward of a step is (survival_reward − cost rate) · control_dt. Whoever violates
-    a limit fails, which ends the episode and costs survival_reward for every second not lived. Whoever reaches the goal of
-    a first-exit task is paid survival_reward for every remaining second at once, so that dawdling never pays more than
-    arriving. For every episode, however it ends, return + cost = `survival_pay`. So the greatest return is the least cost,
-    whatever survival_reward is.
+    The reward of a step is (survival_reward − cost rate) · control_dt. A violated limit is a failure: it ends the episode and
+    costs survival_reward for every remaining second. Reaching the goal of a first-exit task pays survival_reward for
+    every remaining second at once, so that delaying the arrival never pays more than arriving. However an episode ends,
+    return + cost = `survival_pay`. So maximizing the return minimizes the cost, for any value of survival_reward.
 
     x is a state (..., n) and u what the actuators apply (..., m), as `STATE` and `ACTION` of the robot name them; c are the
     episode's constants (..., nc). Cost, margins, goal and observation are written with `ops`, so that NumPy, CasADi and torch
@@ -125,7 +124,7 @@ class Task(ABC):
         return self.margin_names
 
     def problem(self) -> str:
-        """The task's name and the fields that define its optima: tells whether an optimum or a policy belongs to a task."""
+        """The task's name and the fields that define its optima. It identifies the task of an optimum or a policy."""
         named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
         named = (name for name in named if name not in self.MAY_BE_ZERO or getattr(self, name))
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
@@ -198,7 +197,7 @@ class Task(ABC):
         return []
 
     def guesses(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-        """States (n+1, n_x) and actions (n, n_u) from state x from which optimizers start, the likeliest first.
+        """States (n+1, n_x) and actions (n, n_u) from state x as initial guesses of optimizers, the likeliest first.
 
         They need not be motions of the robot; n = `steps`, or less for first-exit tasks. The default goes straight to the
         end of the reference, and stays there.

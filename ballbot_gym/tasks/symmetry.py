@@ -48,7 +48,7 @@ class Route:
     obstacles: int
     """Number of obstacles n of an observation, repeated ones included."""
     layout: Callable[[tuple[Any, ...]], tuple[Any, ...]]
-    """Observation -> where the obstacles lie (3 n). It hardly changes while an episode goes on."""
+    """Observation -> where the obstacles lie (3 n). It hardly changes during an episode."""
     sides: Callable[[tuple[Any, ...], tuple[Any, ...]], tuple[Any, ...]]
     """Observation, and 1 or −1 for every obstacle that is passed on its nearer or farther side -> 1 or −1 for every obstacle
     that is passed on its left or on its right."""
@@ -72,8 +72,8 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """Orbit's observation as seen from the ball: outwards is forwards, and the commanded motion goes to the left.
 
     Then comes the commanded centripetal acceleration, v²/r, in units of 10 m/s². Leans and forces of the steady orbit are
-    nearly linear in it, and so slow orbits need no other rule than fast ones. The last five tell small errors apart
-    (`_fine`): of radius, velocity, and of the lean from the steady orbit's. Without them a policy rides beside the circle.
+    nearly linear in it, and so slow orbits need no other rule than fast ones. The last five resolve small errors
+    (`_fine`): of radius, velocity, and of the lean from the steady orbit's. Without them a policy rides next to the circle.
 
     The body's axis is rotated instead of the angles γ and θ, because a rotation about the vertical takes axis to axis
     exactly. The body's inertia about its own axis, 1 % of the other, is what the symmetry leaves out.
@@ -148,11 +148,11 @@ def _steady_lean(pull: Any, radius: Any, substitutions: int = 3) -> Any:
 def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """Weave's observation as seen along the way: the next obstacles, the first of them to the left of the goal's line.
 
-    Each obstacle is told by how far ahead it is, by how far to the left the nearer way past it is, and by its radius. The
+    Each obstacle is described by the distance ahead, by how far to the left the nearer way past it is, and by its radius. The
     nearer way is the one on the side of the line through the goal along x. It does not change while the robot moves, so
     a policy that takes it does not waver. It is best at every obstacle in four of five drawn slaloms, and costs 0.2 % on
-    average. Where the sides that a route decides are behind the observation, the way on these is told in place of the nearer
-    one, and the radius counts as negative where an obstacle is to be passed on its right, as seen in the frame.
+    average. If the sides of a route are appended to the observation, the way on these sides replaces the nearer one. The
+    radius is then negative for an obstacle that is to be passed on its right, as seen in the frame.
 
     Obstacles that the ball has passed leave the list, and the next take their places. The side of the last one decides
     behind it too, so that nothing flips where the robot comes to rest.
@@ -208,13 +208,13 @@ def _slalom_sides(observation: tuple[Any, ...], farther: tuple[Any, ...]) -> tup
 
 
 def _fine_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
-    """As `_slalom`, and then what tells small errors of rest at the goal apart, for learning from scratch."""
+    """Same as `_slalom`, followed by features that resolve small errors at rest in the goal, for learning from scratch."""
     features, back = _slalom(observation)
     return (*features, *_fine_rest(features)), back
 
 
 def _rest(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
-    """Stabilize's observation, and then what tells small errors of rest at the goal apart, for learning from scratch."""
+    """Stabilize's observation, followed by features that resolve small errors at rest, for learning from scratch."""
     return (*observation, *_fine_rest(observation)), lambda action: action
 
 
@@ -260,7 +260,7 @@ def _gate(observation: tuple[Any, ...], fine: bool = False) -> tuple[tuple[Any, 
 
 
 def _fine(error: Any, tolerance: float) -> Any:
-    """An error in which what is small beside the tolerance shows, and what is large is ±1."""
+    """An error, scaled so that values below the tolerance are resolved and large values are ±1."""
     return error / ops.sqrt(error * error + tolerance * tolerance)
 
 

@@ -63,7 +63,7 @@ class TrackFilter:
         self._noise = np.diag(np.maximum(track.noise, _LEAST_NOISE)) ** 2
 
     def reset(self, x: np.ndarray, c: np.ndarray | None = None) -> None:
-        """Starts an episode, of which sensors report state x (8,) at first, or B episodes (B, 8); c does not matter."""
+        """Starts an episode whose first sensor reading is state x (8,), or B episodes (B, 8). It ignores c."""
         one_for_each = (*x.shape[:-1], len(self._delays))
         calls = -(-int(np.prod(one_for_each)) // LANES)
         count = calls * LANES
@@ -188,7 +188,7 @@ _KNOWN = 1e-3  # standard deviation of what they all share, SI units
 class SensorFilter:
     """Estimates the state `x` (11,) of a robot with wheels from its sensors and the forces of its wheels.
 
-    The robot and its delay are known: `factors` and `delay` are as of a `TrackFilter` that has nothing to estimate.
+    The robot and its delay are known: `factors` and `delay` are those of a `TrackFilter` that has nothing to estimate.
 
     | attribute | shape | meaning |
     |---|---|---|
@@ -212,7 +212,7 @@ class SensorFilter:
         self._noise = np.diag(self.reading_variance)
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
-        """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
+        """Starts an episode with constants c (nc,), whose first observation is `seen` (no,)."""
         mean, deviations = self.expected_start(c)
         self._z, self._p = np.concatenate([seen[9:11], mean[2:]]), np.diag(deviations) ** 2
         found, slopes = self.model(self._z[:11], np.zeros(3))

@@ -151,7 +151,7 @@ class _Batch:
     def _given(self, of: np.ndarray, steps: int, c: np.ndarray | None = None, free_time: bool = False) -> np.ndarray:
         """Parameters of `ilqr`, (J, np), of episodes `of` (J,), or with other constants (B, nc).
 
-        LQR's cost-to-go counts where so many control steps end before the episode does.
+        LQR's cost-to-go is added if `steps` control steps end before the episode does.
         """
         c = (self._c if c is None else c)[of]
         _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
@@ -219,8 +219,8 @@ class _Batch:
     ) -> np.ndarray:
         """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,).
 
-        After guesses that end early, LQR goes on. Where that costs something else than its cost-to-go, the whole episode is
-        solved from there.
+        After guesses that end early, LQR continues. If its actual cost differs from its cost-to-go, the whole episode is
+        solved with this motion as the guess.
         """
         if not len(guesses.of):
             return np.zeros(0)
@@ -297,7 +297,7 @@ class _Batch:
         return x, u / self._params.force_limit
 
     def _paths(self, rows: np.ndarray) -> tuple[list[int], list[np.ndarray]]:
-        """Guessed paths, and of which episodes."""
+        """The index of the episode of each guessed path, and the paths."""
         of, paths = [], []
         for i in rows.tolist():
             some = self._task.guess_paths(self._x0[i], self._c[i], self._params)[:CONSIDERED]
@@ -431,7 +431,7 @@ class _Batch:
 
 
 def _shifted(values: np.ndarray, later: int) -> np.ndarray:
-    """(J, n, k) values, each so many steps later; the first or last ones are repeated."""
+    """(J, n, k) values, each shifted by `later` steps; the first or last ones are repeated."""
     n = values.shape[1]
     return values[:, np.clip(np.arange(n) - later, 0, n - 1)]
 

@@ -5,7 +5,7 @@ dynamics. Then each iteration sweeps backwards with the box-constrained Riccati 
 differential dynamic programming" (2014), and simulates the new feedback, with a shorter step where that raises the cost.
 
 The other inequalities g ≥ 0 are the task's margins, its goal and the robot's friction. Each costs m·w·f(g/w) with a
-multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), which goes on as a parabola below t = −½ (Ben-Tal
+multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), continued as a parabola below t = −½ (Ben-Tal
 and Zibulevsky, "Penalty/barrier multiplier methods for convex programming problems", 1997). So constraints that are not
 violated yet are felt too, and steps can stay long.
 
@@ -87,7 +87,7 @@ class Motions:
 
     @classmethod
     def guessed(cls, of: np.ndarray, steps: np.ndarray, x: np.ndarray, a: np.ndarray) -> "Motions":
-        """Guesses, of which nothing else is known."""
+        """Guesses, without costs or multipliers yet."""
         none = np.zeros((len(of), 0))
         return cls(of, steps, x, a, none, none, np.full(len(of), np.inf), np.zeros(len(of), bool), none, none)
 
@@ -96,7 +96,7 @@ class Motions:
         return Motions(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def put(self, rows: np.ndarray, others: "Motions", which: np.ndarray) -> None:
-        """Puts the motions `which` of others in place of the rows at the same indices."""
+        """Replaces the rows `rows[which]` by the motions `which` of others."""
         for field in fields(self):
             getattr(self, field.name)[rows[which]] = getattr(others, field.name)[which]
 
@@ -211,7 +211,7 @@ class _Ilqr:
             x0: (J, 8) initial states.
             steps: n.
             length: of a step, s.
-            given: as of `solve`.
+            given: same as in `solve`.
             paths: (J, n, 4) where to steer the ball, m, and leans that are added, rad.
             settings: of this feedback, its bandwidth, rad/s, and its time constant, s.
             ends: (J, 8) states about which LQR acts.
