@@ -102,11 +102,11 @@ class BallbotBatch:
 
     `transition` is a pure function of state and actions; `reset` and `step` apply it to `self.state`. Gradients flow
     through `step` into earlier actions until an episode ends. The physics is the closed form of
-    `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to go on from there. Copies and
+    `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to continue from there. Copies and
     pickles are independent batches in the same state.
 
-    As in Gymnasium, the seed s gives env i the seed s + i. So batches with the seeds 0 and 1 draw the same episodes, moved by
-    one env. Give each run the seed that `seeding.spawned` makes of its own.
+    As in Gymnasium, the seed s gives env i the seed s + i. So batches with the seeds 0 and 1 share all
+    episodes but one. Use `seeding.spawned` to derive a separate seed for each run.
     """
 
     def __init__(

@@ -104,9 +104,9 @@ class TaskEnv:
 class BallbotEnv(TaskEnv, gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
-    The reward of a step is `task.survival_reward` · control_dt less what the step cost. A failure ends the episode, and its
-    last step costs survival_reward for every second not lived. So for every episode return + cost = `task.survival_pay`,
-    and the best return is the least cost; see `Task`.
+    The reward of a step is `task.survival_reward` · control_dt minus the step's cost. A failure ends the episode, and its last
+    step costs survival_reward for every remaining second. So return + cost = `task.survival_pay` in every episode, and
+    maximizing the return minimizes the cost; see `Task`.
 
     `info` has, after `reset` and each `step`:
 
@@ -371,9 +371,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         return EnvState(self.task, *held, self._sensors)
 
     def set_state(self, state: EnvState) -> None:
-        """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
+        """Continues from a state that `get_state` of this env returned, or `get_state` of an env with the same arguments.
 
-        An env that `gymnasium.make` returned wants a `reset` before its first `step` all the same.
+        An env that `gymnasium.make` returned still needs a `reset` before its first `step`.
 
         Raises:
             ValueError: the state is of another task, or of an env with other randomization.

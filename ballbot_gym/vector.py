@@ -65,7 +65,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
     `violated` in `infos` may share memory and are read-only. Observations and states are in Fortran order, component by
     component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied.
 
-    `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
+    `copy.deepcopy` and `pickle` make independent envs in the same state. The same actions then give bit-identical results.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -103,7 +103,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 compiler nor CasADi. "torch" computes them in torch, and `compile` says whether that is compiled. "numpy"
                 needs nothing else, supports what "native" supports, and is the slowest. "auto" takes "native" on a CPU if it
                 supports the arguments and compile is neither True nor False. Otherwise it takes "torch", or "numpy" if
-                torch is not installed. All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotArrays`.
+                torch is not installed. All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch`
+                or a `BallbotArrays`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as

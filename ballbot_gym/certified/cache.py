@@ -117,8 +117,6 @@ def _formulas(task: Task, params: Robot) -> str:
         kinds = [kind for kind in type(task).__mro__ if issubclass(kind, Task) and kind is not Task]
         try:
             return "".join(map(inspect.getsource, kinds))
-        except (
-            OSError,
-            TypeError,
-        ):  # changes of a task without source code go unnoticed, so this process alone keeps its optima
+        except (OSError, TypeError):
+            # changes of a task without source code go unnoticed, so its optima are kept for this process alone
             return uuid.uuid4().hex

@@ -203,8 +203,8 @@ class Ballbot(_Derived, Robot):
     def contact(self, x: Vector, u: Vector) -> FloorForce:
         """The floor's force on the ball, (f_x, f_y, N) in N, for state x and action u.
 
-        A floor pushes only, N ≥ 0, and a coefficient of friction µ gives |f| ≤ µN. A ball that translates, and one that
-        rolls without slipping in this model, ask of their floor whatever this says; see `limits`.
+        A real floor can only push, N ≥ 0, and a coefficient of friction µ gives |f| ≤ µN. This model does not limit the
+        force: its ball always translates, or rolls without slipping. See `limits`.
         """
         return self.floor_force(x, u, self.accelerations(x, u))
 

@@ -205,7 +205,7 @@ class Randomization:
         return params.varied(**dict(zip(names, drawn[:4], strict=True)), force=force, friction=friction)
 
     def resting(self, none: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
-        """What an actuator remembers that was asked for no force, none (2): the memory of `actuate`; () where it is ideal."""
+        """The memory of `actuate` of an actuator at rest, whose earlier commands were `none` (2); () if it is ideal."""
         return none * (1 + self.delay_steps(control_dt)[1]) if self.varies_actuator else ()
 
     def actuate(

@@ -36,10 +36,10 @@ _TRACKS = {
 
 
 class FilteredController:
-    """A controller that acts on what `filter` estimates, which is the filter that one of `FILTERS` names.
+    """A controller that acts on the estimates of `filter`, one of the filters in `FILTERS`.
 
-    With wheels "-ekf" makes the state from sensors. Every other filter knows what may vary on a track, and how far. Then it
-    acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
+    For robots with wheels "-ekf" estimates the state from sensors. Every other filter uses the ranges of what varies on its
+    track. It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
     """
 
     def __init__(self, task: Task, params: Robot, ending: str, controller: Controller):

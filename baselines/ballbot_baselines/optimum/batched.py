@@ -3,7 +3,7 @@
 The search is that of `search.py`, for all episodes together:
 
 - Where a task ends at rest, only its first seconds are optimized, with LQR's cost-to-go as the cost of their last state, and
-  then LQR is simulated to the end. Where that costs something else than LQR's cost-to-go, the whole episode is optimized.
+  then LQR is simulated to the end. If its actual cost differs from LQR's cost-to-go, the whole episode is optimized.
 - Tasks that end at rest without obstacles start from the cheapest simulated recovery (`righting.steering`).
 - Slaloms are first solved without their obstacles. That predicts what every choice of sides costs (`sides.py`), and the
   likely ones are compared with forces held longer. The best is tried again, passing all obstacles a step later and earlier.

@@ -9,7 +9,7 @@ multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), co
 and Zibulevsky, "Penalty/barrier multiplier methods for convex programming problems", 1997). So constraints that are not
 violated yet are felt too, and steps can stay long.
 
-Where a task ends at rest, LQR's cost-to-go can stand for the end of an episode.
+If a task ends at rest, LQR's cost-to-go can replace the last part of an episode.
 """
 
 import ctypes
@@ -141,13 +141,15 @@ class _Ilqr:
 
     Raises:
         machine_code.NoMachineCodeError: it cannot be compiled here.
-        NotImplementedError: the task has an operation that `codegen` does not know, or a clock; or the
+        NotImplementedError: the task has an operation that `codegen` does not support, or a clock; or the
             robot has no `BATCHED_OPTIMA`.
     """
 
     def __init__(self, task: Task, params: Robot, free_time: bool = False):
         if task.clock:
-            raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
+            raise NotImplementedError(
+                f"{task.id} has a clock, which batches of optima do not support; use find_optimum"
+            )
         if not params.BATCHED_OPTIMA:
             raise NotImplementedError(
                 f"many optima at once do not support {type(params).__name__}, see Robot.BATCHED_OPTIMA; find_optimum solves "
