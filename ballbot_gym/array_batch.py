@@ -25,7 +25,7 @@ class BallbotArrays(BallbotNative):
     compiled = False
 
     def __init__(self, task: Task, num_envs: int, dtype: type[np.floating], params: Robot):
-        """Makes the envs; arguments as of `BallbotNative`.
+        """Makes the envs; the arguments are those of `BallbotNative`.
 
         Raises:
             ValueError: num_envs out of range.
@@ -45,7 +45,7 @@ class BallbotArrays(BallbotNative):
         return self._rows(task.start(z[count:], tuple(c), self.params), len(seed)), c
 
     def _rows(self, parts: Sequence[Any], size: int) -> np.ndarray:
-        """(n, B) of n components, of which some may be single numbers."""
+        """(n, B) array of n components. Some components may be single numbers."""
         rows = np.empty((len(parts), size), self.dtype)
         for row, part in zip(rows, parts, strict=True):
             row[:] = part

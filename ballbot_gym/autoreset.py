@@ -31,10 +31,10 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
     """One control step of a batch, with NumPy arrays in and out.
 
     Args:
-        batch: which goes on. Where its `restarts` holds, episodes that end are followed by the next ones at once. Else the
-            envs stay at their ends.
+        batch: the envs that take the step. If its `restarts` is true, the next episode starts at once where one ends.
+            Otherwise the envs stay in their final states.
         actions: (B, 2).
-        waiting: (B,) bool, the envs that ignore their action and begin their next episode; None where there are none.
+        waiting: (B,) bool, the envs that ignore their action and start their next episode; None if there are none.
 
     Raises:
         ValueError: an action is not finite; the envs stay as they are.
@@ -69,10 +69,10 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
         end = info_of(before._replace(x=result.final_x), last_measured, violated, *now)
         now = tuple(_without(part, ended) for part in now)
     info = info_of(state, measured, violated, *now)
-    return told(seen, reward, result.terminated, result.truncated, info, end, last[ended])
+    return step_result(seen, reward, result.terminated, result.truncated, info, end, last[ended])
 
 
-def told(
+def step_result(
     observation: np.ndarray,
     reward: np.ndarray,
     terminated: np.ndarray,
@@ -81,7 +81,7 @@ def told(
     end: Info | None,
     last: np.ndarray,
 ) -> Step:
-    """A step as Gymnasium tells it, with masks in its infos.
+    """What Gymnasium's `step` returns, with masks in its infos.
 
     Args:
         observation: (B, no) float32.
@@ -136,14 +136,14 @@ def info_of(
     """An info. Arrays that share memory with the arguments' state are read-only.
 
     Args:
-        state: a `BatchState` with what is told of states, constants and draws, whatever its arrays are.
+        state: a `BatchState` with the states, constants and draws that the info reports. Its arrays may be of any kind.
         measured: (B,) what the robot measures, by name.
-        violated: (B,) int64, as of `BatchStep`, where `failure` holds.
+        violated: (B,) int64, same as in `BatchStep`, where `failure` is true.
         cost: (B,) float64, of the step.
         reward_parts: (3, B) float64, which add up to the reward.
         force: (2, B) N.
         success, failure, clipped: (B,) bool.
-        grip: (4, B), as of `BatchStep`; (0, B) where friction is unlimited.
+        grip: (4, B), same as in `BatchStep`; (0, B) where friction is unlimited.
     """
     x, c, drawn = as_array(state.x).T, as_array(state.c).T, as_array(state.drawn)
     size = len(cost)

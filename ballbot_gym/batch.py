@@ -39,11 +39,11 @@ with imports_of("a batch of environments", "train"):
 _log = logging.getLogger(__name__)
 
 COMPILE_FROM = 1024
-"""Batch size from which compile="auto" compiles. For smaller batches half a minute of compiling seldom pays."""
+"""Batch size from which compile="auto" compiles. Compiling takes half a minute, which seldom pays off for smaller batches."""
 
-# By default a loop holds at most 64 operations, and results pass from one loop to the next through memory. And by default the
-# compiler writes an operation anew into each that reads its result: within one loop it keeps the result anyway, and
-# compiling takes twice as long.
+# By default a loop holds at most 64 operations, and results pass from one loop to the next through memory. By default the
+# compiler also repeats an operation in every operation that reads its result. Within one loop the result is kept in any
+# case, so the repetition only doubles the time of compiling.
 COMPILE_OPTIONS: dict[str, Any] = {
     "max_fusion_size": 1000,
     "realize_opcount_threshold": 2,
@@ -100,11 +100,11 @@ class BallbotBatch:
 
     `transition` is a pure function of state and actions; `reset` and `step` apply it to `self.state`. Gradients flow
     through `step` into earlier actions until an episode ends. The physics is the closed form of
-    `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to go on from there. Copies and
+    `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to continue from there. Copies and
     pickles are independent batches in the same state.
 
-    As in Gymnasium, the seed s gives env i the seed s + i. So batches with the seeds 0 and 1 draw the same episodes, moved by
-    one env. Give each run the seed that `seeding.spawned` makes of its own.
+    As in Gymnasium, the seed s gives env i the seed s + i. So batches with the seeds 0 and 1 share all
+    episodes but one. Use `seeding.spawned` to derive a separate seed for each run.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class BallbotBatch:
             params: the nominal robot as a Robot; the same as robot.
             randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a Robot.
-            history, observation: as of `BallbotEnv`.
+            history, observation: same as in `BallbotEnv`.
             **task_fields: fields of the task that replace its defaults.
 
         Raises:

@@ -168,7 +168,7 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
 
 
 def text(name: str) -> str:
-    """A file of C code that lies beside this one."""
+    """The text of a file of C code in the folder of this module."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 

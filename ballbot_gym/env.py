@@ -46,7 +46,7 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 class EnvState(NamedTuple):
-    """What `BallbotEnv.get_state` returns: everything that decides how an episode goes on. It may be pickled."""
+    """What `BallbotEnv.get_state` returns: everything that determines the rest of an episode. It may be pickled."""
 
     task: Task
     x: State
@@ -104,9 +104,9 @@ class TaskEnv:
 class BallbotEnv(TaskEnv, gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
-    The reward of a step is `task.survival_reward` · control_dt less what the step cost. A failure ends the episode, and its
-    last step costs survival_reward for every second not lived. So for every episode return + cost = `task.survival_pay`,
-    and the best return is the least cost; see `Task`.
+    The reward of a step is `task.survival_reward` · control_dt minus the step's cost. A failure ends the episode, and its last
+    step costs survival_reward for every remaining second. So return + cost = `task.survival_pay` in every episode, and
+    maximizing the return minimizes the cost; see `Task`.
 
     `info` has, after `reset` and each `step`:
 
@@ -121,7 +121,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
     | success | the task's goal holds at the end of the episode |
     | is_success | the same, under the name that Stable-Baselines3 looks for |
     | failure | a limit is violated: the robot fell, touched something or left the arena |
-    | violated | the index of that limit in `limit_names`, as of "tilt", "arena" or "obstacle 2"; else −1 |
+    | violated | the index of that limit in `limit_names`, which holds "tilt", "arena" or "obstacle 2", for example; else −1 |
     | constraint_cost | 1.0 where a limit is violated, else 0.0: the cost of safe reinforcement learning |
     | force | (2,) N, applied in this step (0 after `reset`); with wheels (3,), the pull of each at standstill |
     | clipped | the action was outside [−1, 1] and was clipped |
@@ -140,8 +140,8 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
 
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
-    `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
-    copy of a Bullet env has a physics client of its own. The page is not copied.
+    `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state. The same actions then give
+    bit-identical results. A copy of a Bullet env has a physics client of its own. The page is not copied.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
@@ -173,8 +173,8 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
                 which takes 2 ms and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, such as "paper", "rolling", "kugle" or "omni", or a Robot. Tasks draw other
                 episodes for some.
-            history: so many earlier observations follow the present one in each observation, the latest first, each with the
-                action (2) that was taken on it. Before the episode began they are the first one, with the action 0.
+            history: number of earlier observations that are appended to each observation, the latest first, each with the
+                action (2) that followed it. At the start of an episode they are copies of its first one, with the action 0.
             observation: "state"; or "sensors" of a robot with wheels, as `ballbot_gym.robot.sensors` says.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
@@ -353,7 +353,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         return None
 
     def get_state(self) -> EnvState:
-        """The state of the env in its episode, from which `set_state` goes on bit-identically, for instance in tree search.
+        """The state of the env in its episode. `set_state` continues from it bit-identically, for instance in tree search.
 
         Raises:
             gymnasium.error.ResetNeeded: before `reset`.
@@ -371,9 +371,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         return EnvState(self.task, *held, self._sensors)
 
     def set_state(self, state: EnvState) -> None:
-        """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
+        """Continues from a state that `get_state` of this env returned, or `get_state` of an env with the same arguments.
 
-        An env that `gymnasium.make` returned wants a `reset` before its first `step` all the same.
+        An env that `gymnasium.make` returned still needs a `reset` before its first `step`.
 
         Raises:
             ValueError: the state is of another task, or of an env with other randomization.
@@ -459,7 +459,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             did = self._judge.judge(x, (0.0,) * self.params.action_size, x, 0, 0.0)
             if did is not None and did[7] < 0:
                 return self._judge, did[8:]
-            if self._state:  # its episode goes on where this one cannot start
+            if self._state:  # the episode of the env continues if this one cannot start
                 self._judge.c[:] = self._constants
         task = self.task
         if violated := task.violated(x, task.at(c, 0.0)):

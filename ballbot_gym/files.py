@@ -40,7 +40,7 @@ def read(path: str | Path, limit: int = READ_LIMIT) -> bytes:
     try:
         if not os.path.exists(path):
             raise FileError(f"{path}: no such file")
-        if not os.path.isfile(path):  # a pipe or a device could be read for ever
+        if not os.path.isfile(path):  # reading a pipe or a device may never end
             raise FileError(f"{path} is no regular file")
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -170,7 +170,7 @@ def write(path: str | Path, content: bytes | str) -> Path:
     if path.exists() and not path.is_file():
         raise FileError(f"{path} is no regular file, and is not replaced by one; give another path")
     path.parent.mkdir(parents=True, exist_ok=True)
-    # a name that nobody can guess, and a file that was not there: another user's link would lead to another file
+    # The name cannot be guessed, and the file must be new. Otherwise another user's link could lead to another file.
     unfinished = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     try:

@@ -52,7 +52,7 @@ def missing(package: str, library: str | None, extra: str | None = None) -> Modu
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra, for whoever has the package from an index, and for whoever has a checkout."""
+    """The commands that install an extra: the one for an installed package, and the one for a checkout."""
     return f'pip install "ballbot-gym[{extra}]", or in a checkout pip install -e ".[{extra}]"'
 
 

@@ -105,7 +105,7 @@ def cache_folder() -> Path:
 
 
 def _make_private(folder: Path) -> None:
-    """Makes the folder where it is missing, and checks that nobody else can put a library into it.
+    """Makes the folder if it is missing, and checks that no other user can put a library into it.
 
     Raises:
         PermissionError: the folder belongs to another user, or others may write into it.
@@ -115,7 +115,7 @@ def _make_private(folder: Path) -> None:
 
 
 def check_private(path: Path, variable: str) -> None:
-    """Checks that nobody else can write into a folder or a file, whose folder the environment variable names.
+    """Checks that no other user can write into a folder or a file. The environment variable names its folder.
 
     Raises:
         PermissionError: it belongs to another user, or others may write into it.
@@ -143,7 +143,7 @@ def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str
 
 
 def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, ...]) -> None:
-    """Compiles C code to the shared library `built`; the code lies beside it.
+    """Compiles C code to the shared library `built`. The code is saved in the same folder.
 
     Raises:
         subprocess.CalledProcessError: the compiler refuses the code or a flag.

@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import machine_code
-from ballbot_gym.autoreset import Info, Step, info_of, told
+from ballbot_gym.autoreset import Info, Step, info_of, step_result
 from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.identity import problem_digest
@@ -29,7 +29,8 @@ from ballbot_gym.tasks import Task
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
-"""Number of envs from which threads share the work: 2,048 take as long on two as on one, and 4,096 a seventh less."""
+"""Smallest number of envs whose steps several threads share. Two threads take as long as one for 2,048 envs, and a seventh
+less for 4,096."""
 
 
 FLAG_ROWS = 6
@@ -44,7 +45,7 @@ Computed = tuple[np.ndarray, ...]
 
 @fixed("task", "params", "randomization", "history", "num_envs", "dtype")
 class BallbotNative:
-    """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
+    """B ballbots that do one task, with the `state`, `initial_state`, `step` and `robot` of `BallbotBatch`.
 
     The fields of `BatchState` and `BatchStep` are NumPy arrays. Arrays of a state are never written into.
     """
@@ -63,7 +64,7 @@ class BallbotNative:
         """Makes the envs.
 
         Args:
-            task, num_envs, params: as of `BallbotBatch`.
+            task, num_envs, params: same as in `BallbotBatch`.
             dtype: np.float32 or np.float64.
             threads: among which large batches are divided.
             code: the library of `codegen`'s functions; default, that of the task and the robot.
@@ -170,7 +171,7 @@ class BallbotNative:
             rows = rows[self._told_rows :]
             end = self._info(old._replace(x=rows[: self.params.state_size]), rows, pay[5:], flags[6:], violated)
             last = last.take(ended, 0)
-        return told(observation, pay[0], flags[0], flags[1], now, end, last)
+        return step_result(observation, pay[0], flags[0], flags[1], now, end, last)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
         """What a step from a state computes, and whether an action is not finite."""
@@ -222,7 +223,7 @@ class BallbotNative:
         """A step, by several threads where that is faster."""
         if self.num_envs >= _PARALLEL_FROM:
             for jobs in _helpers(self.threads - 1):
-                if jobs.empty():  # else a helper is late, and need not be told twice
+                if jobs.empty():  # otherwise a late helper still has the same call in its queue
                     jobs.put((self._code.step, memory))
         self._code.step(memory)
 
@@ -263,7 +264,7 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
     dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
     actions = np.asfortranarray(np.array(actions, dtype)[:, np.arange(params.action_size) % 3])
-    told = []
+    outcomes = []
     batch = (
         BallbotNative(task, len(actions), dtype, params, code=code),
         BallbotArrays(task, len(actions), dtype, params),
@@ -273,13 +274,13 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
         values = {"first observation": envs.observe(start), "start": start.x, "constants": start.c}
         *returned, infos = envs.step(actions)
         ends = {f"final {name}": part for name, part in infos.pop("final_info", {}).items()}
-        told.append(
+        outcomes.append(
             values
             | dict(zip(("observation", "reward", "terminated", "truncated"), returned, strict=True))
             | infos
             | ends
         )
-    found, expected = told
+    found, expected = outcomes
     for name in expected:
         if not np.allclose(found.get(name, np.nan), expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
@@ -337,7 +338,7 @@ def _code(task: Task, params: Robot, double: bool) -> ctypes.CDLL:
 
 @cache
 def _helpers(count: int) -> tuple["SimpleQueue[Any]", ...]:
-    """The queues of so many threads, which call functions with an argument."""
+    """The queues of `count` threads, which call functions with an argument."""
     queues = tuple(SimpleQueue() for _ in range(count))
     for jobs in queues:
         Thread(target=_help, args=(jobs,), name="ballbot", daemon=True).start()

@@ -1,7 +1,8 @@
 """Registration of tasks: by a call in the module that defines one, or by an entry point of its package.
 
 `register_robot` does the same for robots. Names reach other processes in two ways. Gymnasium's spec of a registered task
-names its module, `MODULE:NAME`, which whoever makes the environment imports. Processes that we start get `registered()`.
+names its module, `MODULE:NAME`, and `gymnasium.make` imports that module. Processes that this package starts get
+`registered()`.
 """
 
 import enum
@@ -186,7 +187,7 @@ def load_plugins() -> None:
             try:
                 found = entry.load()
                 register_task(found, entry.name) if group == TASKS_GROUP else found()
-            except (Exception, SystemExit) as error:  # a module that exits must not end whoever imports us
+            except (Exception, SystemExit) as error:  # a module that exits must not end the process that imports it
                 package = entry.dist.name if entry.dist else "a package"
                 warnings.warn(f"{package}: {group} {entry.name!r} ({entry.value}) fails: {error!r}", stacklevel=2)
 

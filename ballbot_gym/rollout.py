@@ -38,8 +38,8 @@ class ActionController:
     """A function from observation to action as a Controller. It gets the observations that the env would show.
 
     This is the one place where an observation is turned into a force. It acts in B episodes at once, given states (B, 8) and
-    constants (B, nc), if the function takes observations (B, no). Where `told` is set, it follows, (..., 3),
-    what `ROBOT_FACTORS` names, as far as it is known.
+    constants (B, nc), if the function takes observations (B, no). If `told` is given, (..., 3), these estimates of the three
+    factors in `ROBOT_FACTORS` are appended to the observation.
     """
 
     def __init__(self, task: Task, params: Robot, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0):
@@ -49,7 +49,7 @@ class ActionController:
             task: what is observed.
             params: the robot, whose force limit is the unit of actions.
             action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
-            history: of the observations, as of `BallbotEnv`.
+            history: of the observations, same as in `BallbotEnv`.
         """
         self._task, self._params, self._action, self._history = task, params, action, history
         self._c: tuple[float, ...] = ()
@@ -126,7 +126,8 @@ def rollout(
             with observation="sensors" it gets what they show, and must have an attribute `senses` that is true.
         seed: as for `env.reset`.
         options: as for `env.reset`.
-        watch: is told what the controller sees before each control step, while the env is where the step begins.
+        watch: called before each control step with the observation of the controller, while the env is still in the state
+            where the step starts.
 
     Raises:
         ValueError: the env shows sensors, and the controller wants states.

@@ -1,9 +1,9 @@
 """What one environment computes in a control step, in machine code: the closed form, and what a task says of the step.
 
 `traced` writes the C code, and `machine_code` compiles it within a fraction of a second, once per machine and content. Where
-there is no compiler, Python computes the same: machine code is used only where it gave the very bits of Python in a trial,
-and not for results that are no finite numbers, where Python may raise an error. So nobody can tell from the results which
-of both computed them.
+there is no compiler, Python computes the same. Machine code is used only if its results were bit-identical to Python's in a
+trial. Results that are not finite are computed by Python, which may raise an error. So the results are the same with and
+without a compiler.
 """
 
 import ctypes

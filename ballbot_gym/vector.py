@@ -65,7 +65,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
     `violated` in `infos` may share memory and are read-only. Observations and states are in Fortran order, component by
     component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied.
 
-    `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
+    `copy.deepcopy` and `pickle` make independent envs in the same state. The same actions then give bit-identical results.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -98,12 +98,13 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
-                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`, no history and no
-                sensors. Wheels of some systems have that code of the shipped tasks and robots, and then it needs neither
+                once per task and machine. It needs CasADi, gives no gradients, and does not support `Randomization`, history
+                or sensors. Wheels of some systems have that code of the shipped tasks and robots, and then it needs neither
                 compiler nor CasADi. "torch" computes them in torch, and `compile` says whether that is compiled. "numpy"
-                needs nothing else, knows what "native" knows, and is the slowest. "auto" takes "native" where it can on a
-                CPU, unless compile is True or False; else "torch", or where that is not installed "numpy". All run the
-                same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotArrays`.
+                needs nothing else, supports what "native" supports, and is the slowest. "auto" takes "native" on a CPU if it
+                supports the arguments and compile is neither True nor False. Otherwise it takes "torch", or "numpy" if
+                torch is not installed. All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch`
+                or a `BallbotArrays`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -133,7 +134,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
-        self._ended = np.zeros(self.num_envs, np.bool_)  # whose episodes have ended and not begun anew
+        self._ended = np.zeros(self.num_envs, np.bool_)  # envs that have ended and not restarted
         self.single_action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.single_observation_space = observation_space(self.task, self.params, self.history, self.observation)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -301,7 +302,7 @@ def _in_torch(
     params: Robot,
     **settings: Any,
 ) -> BallbotBatch | BallbotNative:
-    """What computes the envs where torch is installed; arguments as of `BallbotVectorEnv`."""
+    """The batch of envs if torch is installed. The arguments are those of `BallbotVectorEnv`."""
     import torch
 
     from ballbot_gym.batch import BallbotBatch
@@ -334,7 +335,7 @@ def _without_torch(
     history: int,
     observation: str,
 ) -> BallbotNative:
-    """What computes the envs where torch is missing; arguments as of `BallbotVectorEnv`.
+    """The batch of envs if torch is missing. The arguments are those of `BallbotVectorEnv`.
 
     Raises:
         ModuleNotFoundError: an argument asks for what torch alone computes.
@@ -372,7 +373,7 @@ def _without_gradients(
     if not plain:
         if engine != "auto":
             raise ValueError(
-                f'engine="{engine}" knows no Randomization, no history and no sensors; take engine="torch"'
+                f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"'
             )
         return None
     if engine == "numpy":

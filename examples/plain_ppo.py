@@ -1,7 +1,8 @@
 """Plain PPO of Stable-Baselines3 on `gymnasium.make("BallbotStabilize-v0")`, with three of its settings changed.
 
-An observation wrapper shows small errors large as well: tanh(20 o) beside o. Else the robot comes to rest beside the goal.
-Episodes in training last 4 s in place of 8, so that more of the samples are of starts. The measured ones are whole.
+An observation wrapper appends tanh(20 o) to the observation o, which makes small errors large. Without it the robot comes to
+rest near the goal, but not in it. Episodes in training last 4 s instead of 8, so that more of the samples are from starts.
+Episodes in the evaluation have their full length.
 """
 
 import gymnasium
@@ -18,7 +19,7 @@ from ballbot_train import evaluate_fresh
 
 
 def fine(observation: np.ndarray) -> np.ndarray:
-    """Observations (..., 8), and beside them what is small in them, large: (..., 16)."""
+    """(..., 16): observations (..., 8), followed by the same observations with small values made large."""
     return np.concatenate([observation, np.tanh(20 * observation)], -1)
 
 
@@ -47,7 +48,8 @@ def main(steps: int = 3_000_000, seed: int = 0, episodes: int = 1000) -> None:
         seed: of everything that is drawn.
         episodes: fresh episodes in the end.
     """
-    torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work
+    # a network this small is slower on several threads, and many times slower if other programs run
+    torch.set_num_threads(1)
     settings = {"learning_rate": lambda left: 2e-3 * left, "batch_size": 2048, "ent_coef": 0.03}
     model = PPO("MlpPolicy", make_vec_env(make, n_envs=8), seed=spawned(seed), device="cpu", **settings).learn(steps)
     row = evaluate_fresh(Seen(model), "stabilize", episodes=episodes).summary()

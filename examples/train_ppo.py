@@ -77,7 +77,8 @@ def main(
         log_std_init, net_arch, relu: parts of policy_kwargs, which is one setting of PPO.
         save: path of the model in the end, for `ballbot evaluate PATH.zip`.
     """
-    torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work
+    # a network this small is slower on several threads, and many times slower if other programs run
+    torch.set_num_threads(1)
     if falling and learning_rate is None:
         raise ValueError("--falling needs --learning-rate, the step size at the start")
     policy = {"log_std_init": log_std_init, "net_arch": None if net_arch is None else list(net_arch)}

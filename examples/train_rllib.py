@@ -85,7 +85,8 @@ def main(
     from ballbot_gym import TASKS, spawned
     from ballbot_train import evaluate, evaluate_fresh
 
-    torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work
+    # a network this small is slower on several threads, and many times slower if other programs run
+    torch.set_num_threads(1)
     register_env("ballbot", make)
     if not cluster.is_initialized():
         small = (

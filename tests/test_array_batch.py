@@ -58,7 +58,7 @@ def test_actions_that_are_not_finite_are_refused_and_change_nothing():
     with pytest.raises(ValueError, match="finite"):
         env.step(np.array([[0, 0], [np.nan, 0], [0, 0]], np.float32))
     assert env.batch.state is before
-    with pytest.raises(ValueError, match='engine="numpy" knows no Randomization'):
+    with pytest.raises(ValueError, match='engine="numpy" does not support Randomization'):
         BallbotVectorEnv(3, engine="numpy", history=2)
 
 

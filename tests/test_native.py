@@ -185,7 +185,7 @@ def test_auto_takes_machine_code_unless_something_speaks_against_it():
     assert isinstance(BallbotVectorEnv(2, compile=False).batch, BallbotBatch)
     assert isinstance(BallbotVectorEnv(2, compile=True).batch, BallbotBatch)
     assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotBatch)
-    with pytest.raises(ValueError, match='"native" knows no Randomization, no history and no sensors; take'):
+    with pytest.raises(ValueError, match='"native" does not support Randomization, history or sensors; take'):
         BallbotVectorEnv(2, engine="native", randomization=Randomization(body_mass=(0.9, 1.1)))
     with pytest.raises(ValueError, match="engine='native' runs on the CPU, not on cuda"):
         BallbotVectorEnv(2, engine="native", device="cuda")

@@ -36,7 +36,7 @@ from ballbot_gym.trajectory import Trajectory
 
 EPISODES = 200
 TRAJECTORIES = 20
-_FEW = 5  # trajectories in the file of a track, of which there are many, and of a robot with wheels, whose states are larger
+_FEW = 5  # trajectories in the files of tracks, which are many, and of robots with wheels, whose states are larger
 
 _SAME = 1e-6  # of states and, relative, of costs: what rounding differs by between machines is far less
 

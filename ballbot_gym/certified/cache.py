@@ -29,7 +29,7 @@ _MOST_DRAWS = 20
 def episode(task: Task, params: Robot, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Initial state (8,) and constants (nc,) of episode `index` of a task's evaluation set, the same on every machine.
 
-    A later draw takes the place of one from which a robot with limited friction cannot reach the goal.
+    A later draw replaces a draw whose goal a robot with limited friction cannot reach.
     """
     seed = [zlib.crc32(task.id.encode()), index, *([draw] if draw else [])]
     return task.sample(np.random.default_rng(seed), params)
@@ -40,7 +40,7 @@ def starts(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[float, ...]]]:
     """Initial state, constants and what a randomization that moves optima draws, of each draw of `episode`.
 
-    A later draw takes the place of one with which nobody can do the episode. All are the same on every machine.
+    A later draw replaces a draw without a feasible solution. All draws are the same on every machine.
     """
     for draw in range(_MOST_DRAWS):
         drawn: tuple[float, ...] = ()
@@ -117,5 +117,6 @@ def _formulas(task: Task, params: Robot) -> str:
         kinds = [kind for kind in type(task).__mro__ if issubclass(kind, Task) and kind is not Task]
         try:
             return "".join(map(inspect.getsource, kinds))
-        except (OSError, TypeError):  # nobody can tell, so its optima are kept for this process alone
+        except (OSError, TypeError):
+            # changes of a task without source code go unnoticed, so its optima are kept for this process alone
             return uuid.uuid4().hex

@@ -84,7 +84,7 @@ class MujocoSimulator(Simulator):
         except ValueError as error:
             raise RuntimeError(f"MuJoCo refuses this robot: {error}; {params}") from error
         self._data = mujoco.MjData(self._model)
-        # views of it, each of which takes longer to get than to use
+        # views of the data, because getting a view takes longer than using it
         self._positions, self._velocities, self._pushed = self._data.qpos, self._data.qvel, self._data.qfrc_applied
         self._twisted, self._warned = self._data.xfrc_applied, self._data.warning.number
 

@@ -28,7 +28,7 @@ class Simulator(Protocol):
         ...
 
     def memory(self) -> tuple[float, ...]:
-        """What decides how it goes on besides the state; () if nothing does, or if that cannot be restored."""
+        """Internal state that affects later steps, besides the robot's; () if there is none, or if it cannot be restored."""
         return ()
 
     def floor_force(self) -> tuple[float, float, float] | None:

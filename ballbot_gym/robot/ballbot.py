@@ -190,7 +190,7 @@ class Ballbot(_Derived, Robot):
         """As `contact`, of a state's accelerations."""
 
     def ideal(self) -> "Ballbot":
-        """The robot whose ball a force or a torque drives in any direction, in place of whatever drives this one's."""
+        """The same robot, but its ball is driven by a force or a torque in any direction instead of this robot's drive."""
         return self
 
     def turning_ball(self, x: Vector, force: Vector) -> Vector:
@@ -203,13 +203,13 @@ class Ballbot(_Derived, Robot):
     def contact(self, x: Vector, u: Vector) -> FloorForce:
         """The floor's force on the ball, (f_x, f_y, N) in N, for state x and action u.
 
-        A floor pushes only, N ≥ 0, and a coefficient of friction µ gives |f| ≤ µN. A ball that translates, and one that
-        rolls without slipping in this model, ask of their floor whatever this says; see `limits`.
+        A real floor can only push, N ≥ 0, and a coefficient of friction µ gives |f| ≤ µN. This model does not limit the
+        force: its ball always translates, or rolls without slipping. See `limits`.
         """
         return self.floor_force(x, u, self.accelerations(x, u))
 
     def held_contact(self, x: Vector, u: Vector, hold: Any) -> tuple[FloorForce, FloorForce]:
-        """The floor's force, as `contact`, when u begins in state x and after it was held for so many seconds.
+        """The floor's force, as `contact`, when u starts in state x, and again after u was held for `hold` seconds.
 
         The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them. In between, a
         force that is held while the robot falls or rises needs up to twice the friction that it needs at first.
@@ -240,7 +240,7 @@ class Ballbot(_Derived, Robot):
         Args:
             x: (..., n) state.
             u: (..., m) action, in the units of `ACTION`.
-            backoff: as of `grip_limits`.
+            backoff: same as in `grip_limits`.
             hold: s that the action is held: then the robot must grip at the end of this time too, see `held_contact`.
                 Default, at the start alone.
         """

@@ -26,7 +26,7 @@ the body sees it,
 
     Σ a_i f_i = Σ a_i u_i − d r² D w − m r² D ẇ,    ẇ = J v̇ + (J̇ v − ψ̇ e₃ × w).
 
-The other terms are those of `point_ball`, with the body's spin γ̇ sin θ + ψ̇ about its axis in place of γ̇ sin θ, the ball's
+The other terms are those of `point_ball`, with the body's spin γ̇ sin θ + ψ̇ about its axis instead of γ̇ sin θ, the ball's
 energy ½ I_b ω_z², and a torque of the floor against the ball's spin, which is smooth where dry friction jumps. All that makes
 six linear equations M v̇ = q. The body and D are the same about all axes across the body's, so that ψ matters to u alone.
 """
@@ -141,7 +141,7 @@ class Omni(RollingBall):
             raise ValueError(f"Omni: wheels must be Wheels, not {value!r}")
 
     def ideal(self) -> RollingBall:
-        """The same robot with a torque in any direction in place of the wheels."""
+        """The same robot, driven by a torque in any direction instead of the wheels."""
         return RollingBall(**{each.name: getattr(self, each.name) for each in fields(RollingBall)})
 
     @property

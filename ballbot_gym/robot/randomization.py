@@ -71,8 +71,8 @@ class Randomization:
         "body_mass", "ball_mass", "com_height", "inertia", "gain", "delay", "force", "friction",
         "drift_x", "drift_y", "bias_gamma", "bias_theta", "bias_gamma_rate", "bias_theta_rate",
     )  # fmt: skip
-    """Names of what `draw` draws, of which the first 6 stand alone where nothing draws the others: factors, the gain and
-    delay of `actuate`, and errors of the sensors in SI units."""
+    """Names of what `draw` draws: factors, the gain and delay of `actuate`, and errors of the sensors in SI units. If none of
+    the others is drawn, there are only the first 6."""
     PUSH_DRAWS = 3
     """Uniform numbers that `push` takes."""
     NOISE_DRAWS = 8
@@ -205,7 +205,7 @@ class Randomization:
         return params.varied(**dict(zip(names, drawn[:4], strict=True)), force=force, friction=friction)
 
     def resting(self, none: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
-        """What an actuator remembers that was asked for no force, none (2): the memory of `actuate`; () where it is ideal."""
+        """The memory of `actuate` of an actuator at rest, whose earlier commands were `none` (2); () if it is ideal."""
         return none * (1 + self.delay_steps(control_dt)[1]) if self.varies_actuator else ()
 
     def actuate(
@@ -308,7 +308,7 @@ def _pair(name: str, value: Any) -> Range:
 
 
 ROBOT_FACTORS = ("body_mass", "com_height", "force")
-"""What filters estimate of a robot, and informed policies are told: factors on the nominal values."""
+"""Factors on the nominal values of a robot. Filters estimate them, and informed policies take the estimates as inputs."""
 
 TRACKS: dict[str, Randomization] = {
     "unknown": Randomization(body_mass=(0.7, 1.4), com_height=(0.85, 1.15), force=(0.85, 1.1), friction=(0.6875, 1.25)),

@@ -35,12 +35,12 @@ PAPER = "paper"
 def register_robot(
     name: str, urdf: str | Path | Robot, fields: Mapping[str, Mapping[str, float]] | None = None
 ) -> None:
-    """Gives a robot a name, under which environments, experts and commands know it.
+    """Gives a robot a name that environments, experts and commands accept.
 
     Args:
         name: small letters, digits and underscores.
         urdf: its file, with the chain of joints that `read_urdf` describes; or its parameters.
-        fields: fields of tasks, by the task's name, that differ from the defaults, where the usual episodes are beyond it:
+        fields: fields of tasks, by the task's name, that differ from the defaults if the usual episodes are too hard for it:
             `{"stabilize": {"start_lean": 0.3}}`.
 
     Raises:

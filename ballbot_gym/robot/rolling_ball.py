@@ -1,9 +1,9 @@
 """A ballbot whose ball rolls without slipping and does not spin about the vertical, driven by a torque.
 
-The ball turns at ω = e_z × ṗ / r, so to the kinetic energy of `point_ball` comes ½ (I_b/r²) |ṗ|² with the ball's inertia I_b:
-the mass M + m becomes M + m + I_b/r², but not in the weight. The ball is driven by a torque T = r e_z × F between it and the
-body, which the force F stands for. On the ball T does the work T·ω = F·ṗ, as the force F would. On the body −T does the
-work −T·(γ̇ e_y − θ̇ (cos γ e_x − sin γ e_z)). So the generalized forces are
+The ball turns at ω = e_z × ṗ / r. This adds ½ (I_b/r²) |ṗ|² to the kinetic energy of `point_ball`, with the ball's inertia
+I_b: the mass M + m becomes M + m + I_b/r², but not in the weight. The ball is driven by a torque T = r e_z × F between it and
+the body; the action is the equivalent force F. On the ball T does the work T·ω = F·ṗ, as the force F would. On the body −T
+does the work −T·(γ̇ e_y − θ̇ (cos γ e_x − sin γ e_z)). So the generalized forces are
 
     Q_x = Fx,   Q_y = Fy,   Q_γ = −r Fx,   Q_θ = −r Fy cos γ,
 
@@ -29,7 +29,7 @@ class RollingBall(PointBall):
     |---|---|---|
     | ball_inertia | of the ball about its centre | kg·m² |
 
-    A force F on the ball stands for the torque r e_z × F that the body applies to it.
+    A force F on the ball represents the torque r e_z × F that the body applies to it.
     """
 
     ball_inertia: float = field(kw_only=True)

@@ -1,12 +1,12 @@
-"""What a robot with wheels measures of itself: gyroscope, accelerometer and wheel encoders, in place of its state.
+"""What a robot with wheels measures of itself: gyroscope, accelerometer and wheel encoders. These readings replace its state.
 
 Gyroscope and accelerometer sit at the body's centre of mass, along the axes of the body. Both are sampled at 200 Hz, and the
 robot sees their mean over each control step, with the noise of that mean. The mean is Simpson's of the step's beginning,
 middle and end, and the middle is interpolated. The accelerometer reads R⊤ (a + g e_z): g upwards, if the body stands still.
 The encoders count whole ticks of each wheel against the body. In all of it the ball rolls without slipping.
 
-Where an episode begins, sensors read what they would if the wheels had not been driven. The robot is told where that is,
-because the goal of a task is a place. What its leans and speeds are it is not told, and not where it comes to after that.
+At the start of an episode the sensors read what they would if the wheels had not been driven. The start position is
+observed, because the goal of a task is a place. Leans, speeds and later positions are not observed.
 """
 
 import math
@@ -50,7 +50,7 @@ def ideal(params: Any, x: Vector, u: Vector) -> tuple[Any, ...]:
     az = params.gravity + height * (
         2 * sin_g * sin_t * product - sin_g * cos_t * gamma_ddot - cos_g * sin_t * theta_ddot - cos_g * cos_t * rates2
     )
-    # in the frame of the leans, from which the body is turned by ψ
+    # in the frame of the leans; the body is turned by ψ in this frame
     turning = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
     along = cos_g * ax - sin_g * az
     upright = sin_g * ax + cos_g * az

@@ -16,7 +16,7 @@ from ballbot_gym.robot.rolling_ball import RollingBall
 _PACKAGE = Path(__file__).parent.parent
 _IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf", _PACKAGE.parent / "urdf"
 URDF_FOLDER = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
-"""The URDFs of all robots. A wheel holds it inside the package, a checkout beside the package."""
+"""The URDFs of all robots. It lies inside the package in a wheel, and next to the package in a checkout."""
 URDF_PATH = URDF_FOLDER / "ballbot.urdf"
 """The URDF of the paper's robot."""
 ROLLING_URDF_PATH = URDF_FOLDER / "rolling.urdf"

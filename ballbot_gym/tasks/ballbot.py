@@ -41,7 +41,7 @@ class BallbotTask(Task):
 
     @abstractmethod
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
-        """The initial state that `state_draws` uniform numbers z stand for, in an episode with constants c.
+        """The initial state as a function of `state_draws` uniform numbers z, in an episode with constants c.
 
         It may have the first eight components alone. With wheels the robot then neither turns nor spins at the start.
         """
@@ -55,7 +55,7 @@ class BallbotTask(Task):
 
     @abstractmethod
     def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[np.ndarray]:
-        """Ground paths from state x from which optimizers start, one per basin worth trying, the likeliest first.
+        """Ground paths from state x as initial guesses of optimizers, one per basin worth trying, the likeliest first.
 
         Each is (n+1, 2), m, one ball position per control step: n = `steps`, or less for first-exit tasks.
         """
@@ -76,7 +76,7 @@ class BallbotTask(Task):
     def limits(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         """Safe iff every entry ≥ 0: the margins, then the arena's, about the distance to its edge, m.
 
-        The arena is no margin, because it is far from every optimum: optimizers need not know it.
+        The arena is not a margin: every optimum is far from its edge, so optimizers do not need this limit.
         """
         px, py, *_ = ops.components(x)
         x_centre, y_centre, radius = self.arena(c)

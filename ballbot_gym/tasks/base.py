@@ -21,7 +21,7 @@ class Reference:
     """A steady motion that linear control tracks, one point per control step: x (n, 8) and u (n, 2).
 
     An open reference is tracked in time, and after its end its last point. A single point is an equilibrium. A closed
-    reference repeats for ever, and a controller may begin at any of its points.
+    reference repeats indefinitely, and a controller may start at any of its points.
     """
 
     x: np.ndarray
@@ -33,11 +33,10 @@ class Reference:
 class Task(ABC):
     """A finite-horizon optimal-control problem, and the rewards that follow from it.
 
-    Staying alive pays and motion costs: the reward of a step is (survival_reward − cost rate) · control_dt. Whoever violates
-    a limit fails, which ends the episode and costs survival_reward for every second not lived. Whoever reaches the goal of
-    a first-exit task is paid survival_reward for every remaining second at once, so that dawdling never pays more than
-    arriving. For every episode, however it ends, return + cost = `survival_pay`. So the greatest return is the least cost,
-    whatever survival_reward is.
+    The reward of a step is (survival_reward − cost rate) · control_dt. A violated limit is a failure: it ends the episode and
+    costs survival_reward for every remaining second. Reaching the goal of a first-exit task pays survival_reward for
+    every remaining second at once, so that delaying the arrival never pays more than arriving. However an episode ends,
+    return + cost = `survival_pay`. So maximizing the return minimizes the cost, for any value of survival_reward.
 
     x is a state (..., n) and u what the actuators apply (..., m), as `STATE` and `ACTION` of the robot name them; c are the
     episode's constants (..., nc). Cost, margins, goal and observation are written with `ops`, so that NumPy, CasADi and torch
@@ -66,25 +65,25 @@ class Task(ABC):
     constant_names: ClassVar[tuple[str, ...]] = ()
     """Names of the episode's constants c, in order."""
     margin_names: ClassVar[tuple[str, ...]] = ()
-    """What each of `margins` keeps."""
+    """Names of the limits in `margins`, in order."""
     reward_threshold: ClassVar[float | None] = None
     """Mean return on the certified episodes, with default fields, at a mean regret of 10 %."""
     NOT_THE_PROBLEM: ClassVar[frozenset[str]] = frozenset({"survival_reward"})
-    """Fields that move no optimum: they shape rewards, or bound where no optimum goes."""
+    """Fields that do not change optima: they shape rewards, or bound a region that no optimum enters."""
     MAY_BE_ZERO: ClassVar[frozenset[str]] = frozenset()
-    """Fields that may be 0. While they are, `problem` leaves them out, as before they were there."""
+    """Fields that may be 0. `problem` omits fields that are 0, so that it is the same as before they were introduced."""
     mirrors: ClassVar[tuple[Mirror, ...]] = ()
-    """Its mirror images; with no change they form a group."""
+    """Its mirror images. Together with the identity they form a group."""
     frame: ClassVar[str | None] = None
-    """Name in `symmetry.FRAMES` of a frame in which the task looks the same wherever it takes place, or None."""
+    """Name in `symmetry.FRAMES` of a frame in which the task does not depend on place and direction, or None."""
     routed_frame: ClassVar[str | None] = None
-    """Name in `symmetry.FRAMES` of a frame in which a route decides on which side obstacles are passed, or None."""
+    """Name in `symmetry.FRAMES` of a frame that takes the side on which each obstacle is passed as an input, or None."""
     fine_frame: ClassVar[str | None] = None
-    """Name of the same frame with features that tell small errors apart, where `frame` has none; or None."""
+    """Name of the same frame with features that resolve small errors, if `frame` has none; or None."""
     constant_draws: ClassVar[int] = 0
-    """Uniform numbers that `draw_constants` takes."""
+    """Number of uniform numbers that `draw_constants` takes."""
     state_draws: ClassVar[int] = 0
-    """Uniform numbers that `draw_state` takes."""
+    """Number of uniform numbers that `draw_state` takes."""
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
     clock: ClassVar[bool] = False
@@ -116,16 +115,16 @@ class Task(ABC):
 
     @property
     def survival_pay(self) -> float:
-        """What return and cost of every episode add up to: survival_reward · duration. Failing at once costs as much."""
+        """Return plus cost of every episode: survival_reward · duration. It is also the price of failing at the start."""
         return self.survival_reward * self.duration
 
     @property
     def limit_names(self) -> tuple[str, ...]:
-        """What each of `limits` keeps."""
+        """Names of the limits in `limits`, in order."""
         return self.margin_names
 
     def problem(self) -> str:
-        """The task's name and the fields that define its optima: tells whether an optimum or a policy belongs to a task."""
+        """The task's name and the fields that define its optima. It identifies the task of an optimum or a policy."""
         named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
         named = (name for name in named if name not in self.MAY_BE_ZERO or getattr(self, name))
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
@@ -138,12 +137,12 @@ class Task(ABC):
         return ops.stack((*ops.components(c), time), like=c) if self.clock else c
 
     def draw_constants(self, z: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
-        """The constants (nc) that `constant_draws` uniform numbers z in [0, 1) stand for; z may hold batches."""
+        """The constants (nc) as a function of `constant_draws` uniform numbers z in [0, 1); z may hold batches."""
         return ()
 
     @abstractmethod
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
-        """The initial state (8) that `state_draws` uniform numbers z stand for, in an episode with constants c."""
+        """The initial state (8) as a function of `state_draws` uniform numbers z, in an episode with constants c."""
 
     def start(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
         """As `draw_state`, with all components that the robot has.
@@ -179,7 +178,7 @@ class Task(ABC):
         return dict(zip(self.constant_names, map(float, c), strict=True))
 
     def check_constants(self, c: np.ndarray, params: Any) -> None:
-        """Raises a ValueError that names the constant that makes no sense."""
+        """Raises a ValueError that names the first invalid constant."""
 
     @abstractmethod
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
@@ -198,7 +197,7 @@ class Task(ABC):
         return []
 
     def guesses(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-        """States (n+1, n_x) and actions (n, n_u) from state x from which optimizers start, the likeliest first.
+        """States (n+1, n_x) and actions (n, n_u) from state x as initial guesses of optimizers, the likeliest first.
 
         They need not be motions of the robot; n = `steps`, or less for first-exit tasks. The default goes straight to the
         end of the reference, and stays there.
@@ -251,7 +250,7 @@ class Task(ABC):
         return ()
 
     def limits(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """Safe iff every entry ≥ 0, as `limit_names` names it: the margins, and what optimizers need not know."""
+        """Safe iff every entry ≥ 0, as `limit_names` names it: the margins, and limits that optimizers do not need."""
         return self.margins(x, c)
 
     def violated(self, x: Vector, c: Vector) -> str:

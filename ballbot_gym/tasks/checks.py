@@ -1,4 +1,4 @@
-"""What a task must give before anything runs it: the faults that own tasks have, by the name of their method."""
+"""Checks of a task before it is used. Errors name the method of the task that is at fault."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from ballbot_gym.tasks.base import Task
 
 
 def check_methods(task: Task, params: Robot, x: np.ndarray, c: np.ndarray, where: str = "") -> None:
-    """Raises a ValueError that names the method of a task that gives what nothing can use.
+    """Raises a ValueError that names the method of a task that returns an invalid value.
 
     Args:
         task: what is checked.

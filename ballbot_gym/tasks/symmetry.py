@@ -1,6 +1,6 @@
 """Symmetries of tasks, declared once, for learners and policies: mirror images, and frames of reference.
 
-A policy that respects a symmetry learns one situation where another policy learns two or a whole circle of them.
+A policy that respects a symmetry learns a situation once, and not again for every mirror image or direction.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from ballbot_gym.ops import squared
 
 @dataclass(frozen=True)
 class Mirror:
-    """A mirror image: the motion with flipped signs is a motion of the same cost, with the same limits and goal.
+    """A mirror image: flipping these signs turns a motion into another motion with the same cost, limits and goal.
 
     Each field holds 1 or −1 for every component.
     """
@@ -43,12 +43,12 @@ Back = Callable[[tuple[Any, Any]], tuple[Any, Any]]
 
 @dataclass(frozen=True)
 class Route:
-    """What a network needs that decides on which sides obstacles are passed."""
+    """The functions of a network that decides on which side each obstacle is passed."""
 
     obstacles: int
     """Number of obstacles n of an observation, repeated ones included."""
     layout: Callable[[tuple[Any, ...]], tuple[Any, ...]]
-    """Observation -> where the obstacles lie (3 n). It hardly changes while an episode goes on."""
+    """Observation -> positions and radii of the obstacles (3 n). They hardly change during an episode."""
     sides: Callable[[tuple[Any, ...], tuple[Any, ...]], tuple[Any, ...]]
     """Observation, and 1 or −1 for every obstacle that is passed on its nearer or farther side -> 1 or −1 for every obstacle
     that is passed on its left or on its right."""
@@ -63,20 +63,20 @@ class Frame:
     features: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], Back]]
     """Observation, as a tuple of its entries -> features (size), and the way back for actions."""
     route: Route | None = None
-    """Where a route decides on which sides obstacles are passed. `features` then takes these sides behind the observation."""
+    """The route, if one decides on which sides obstacles are passed. These sides are then appended to the observation."""
     steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]] | None = None
-    """Features -> features (size), and action in the frame, of the steady motion in which the episode shall end."""
+    """Features -> features (size), and action in the frame, of the steady motion that is the goal of the episode."""
 
 
 def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """Orbit's observation as seen from the ball: outwards is forwards, and the commanded motion goes to the left.
 
-    Then comes the commanded centripetal acceleration, v²/r, in units of 10 m/s². Leans and forces of the steady orbit are
-    nearly linear in it, and so slow orbits need no other rule than fast ones. The last five tell small errors apart
-    (`_fine`): of radius, velocity, and of the lean from the steady orbit's. Without them a policy rides beside the circle.
+    The next feature is the commanded centripetal acceleration, v²/r, in units of 10 m/s². Leans and forces of steady orbits
+    are nearly linear in it, so one rule fits slow and fast orbits. The last five resolve small errors
+    (`_fine`): of radius, velocity, and of the lean from the steady orbit's. Without them a policy rides next to the circle.
 
-    The body's axis is rotated instead of the angles γ and θ, because a rotation about the vertical takes axis to axis
-    exactly. The body's inertia about its own axis, 1 % of the other, is what the symmetry leaves out.
+    The body's axis is rotated instead of the angles γ and θ, because a rotation about the vertical maps axes to axes exactly.
+    The symmetry neglects the body's inertia about its own axis, which is 1 % of the other inertia.
     """
     x, y, gamma, theta, vx, vy, gamma_dot, theta_dot, radius_error, ex, ey, radius, speed = observation
     distance = ops.sqrt(x * x + y * y + 1e-12)
@@ -148,14 +148,14 @@ def _steady_lean(pull: Any, radius: Any, substitutions: int = 3) -> Any:
 def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """Weave's observation as seen along the way: the next obstacles, the first of them to the left of the goal's line.
 
-    Each obstacle is told by how far ahead it is, by how far to the left the nearer way past it is, and by its radius. The
+    Each obstacle is described by the distance ahead, by how far to the left the nearer way past it is, and by its radius. The
     nearer way is the one on the side of the line through the goal along x. It does not change while the robot moves, so
     a policy that takes it does not waver. It is best at every obstacle in four of five drawn slaloms, and costs 0.2 % on
-    average. Where the sides that a route decides are behind the observation, the way on these is told in place of the nearer
-    one, and the radius counts as negative where an obstacle is to be passed on its right, as seen in the frame.
+    average. If the sides of a route are appended to the observation, the way on these sides replaces the nearer one. The
+    radius is then negative for an obstacle that is to be passed on its right, as seen in the frame.
 
-    Obstacles that the ball has passed leave the list, and the next take their places. The side of the last one decides
-    behind it too, so that nothing flips where the robot comes to rest.
+    Obstacles that the ball has passed are removed, and the next ones take their places. The side of the last obstacle still
+    counts after it is passed, so that the features do not flip while the robot comes to rest.
     """
     x, y, gamma, theta, vx, vy, gamma_dot, theta_dot, *numbers = observation
     count = 3 * _OBSTACLES
@@ -208,13 +208,13 @@ def _slalom_sides(observation: tuple[Any, ...], farther: tuple[Any, ...]) -> tup
 
 
 def _fine_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
-    """As `_slalom`, and then what tells small errors of rest at the goal apart, for learning from scratch."""
+    """Same as `_slalom`, followed by features that resolve small errors at rest in the goal, for learning from scratch."""
     features, back = _slalom(observation)
     return (*features, *_fine_rest(features)), back
 
 
 def _rest(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
-    """Stabilize's observation, and then what tells small errors of rest at the goal apart, for learning from scratch."""
+    """Stabilize's observation, followed by features that resolve small errors at rest, for learning from scratch."""
     return (*observation, *_fine_rest(observation)), lambda action: action
 
 
@@ -240,14 +240,14 @@ def _passed(dx: Any, radius: Any) -> Any:
 
 
 def _gate(observation: tuple[Any, ...], fine: bool = False) -> tuple[tuple[Any, ...], Back]:
-    """Turn's observation, with what decides in it set off: the speed in steps, and the errors at the gate in units of its
-    tolerances.
+    """Turn's observation, with features for what decides the turn: the speed as steps, and the errors at the gate in units of
+    the gate's tolerances.
 
-    Slow turns go directly, fast ones loop. Somewhere between 3.4 and 4.6 m/s, depending on the robot and on the reserve that
-    is kept at the gate, the best way switches. A network that sees the speed alone averages both ways there.
+    Slow turns go directly, and fast turns loop. The best way switches between 3.4 and 4.6 m/s; where exactly depends on the
+    robot and on the reserve that is kept at the gate. A network that observes the speed alone averages both ways there.
 
-    Over a sharp step no way of turning is carried on from one speed to the next. So the steps of the fine frame are 0.1 m/s
-    wide, and leans and lean rates are seen in units of the gate's tolerances too.
+    A policy cannot carry a way of turning over a sharp step to the next speed. So the steps of the fine frame are 0.1 m/s
+    wide. It also has leans and lean rates in units of the gate's tolerances.
     """
     x, y, gamma, theta, vx, vy, gamma_dot, theta_dot, speed = observation
     errors = [(x, 0.2 / 5), (y, 0.2 / 5), (vx, 0.5 / 5), (vy, 0.5 / 5)]
@@ -260,7 +260,7 @@ def _gate(observation: tuple[Any, ...], fine: bool = False) -> tuple[tuple[Any, 
 
 
 def _fine(error: Any, tolerance: float) -> Any:
-    """An error in which what is small beside the tolerance shows, and what is large is ±1."""
+    """An error, scaled so that values below the tolerance are resolved and large values are ±1."""
     return error / ops.sqrt(error * error + tolerance * tolerance)
 
 

@@ -48,9 +48,9 @@ class Turn(BallbotTask):
     further cost. Tilt beyond `max_tilt` fails, and so does leaving the arena. After `duration` the episode is truncated.
 
     Discount: use 0.99 to 0.995, or count time-outs as ends. Arriving pays the survival reward of the remaining time at once.
-    A learner that bootstraps time-outs values standing still as if it went on for ever. The certified turns are then worth
-    36 to 363 more than standing still with a discount of 0.99, 17 to 283 more with 0.995, and 211 to 366 less with 0.998. If
-    time-outs count as ends, turning is worth more with each of these discounts, and 8 to 35 more without discount.
+    A learner that bootstraps time-outs values standing still as if it continued indefinitely. The certified turns are then
+    worth 36 to 363 more than standing still with a discount of 0.99, 17 to 283 more with 0.995, and 211 to 366 less with
+    0.998. If time-outs count as ends, turning is worth more with each of these discounts, and 8 to 35 more without discount.
 
     Survival reward: full force on both axes costs 49 /s, time 5 /s, leans at most 2 /s, and lean rates of 5 rad/s 25 /s. So
     nearly every step costs less than the 100 /s that it pays.

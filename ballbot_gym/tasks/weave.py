@@ -173,7 +173,7 @@ class Weave(BallbotTask):
         return at_rest(x, x_goal, y_goal)
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
-        """At rest at the goal: linear control knows nothing of obstacles."""
+        """At rest at the goal: linear control does not consider obstacles."""
         rest = np.zeros((1, 8))
         rest[0, :2] = c[:2]
         return Reference(rest, np.zeros((1, 2)))

@@ -1,1 +1,1 @@
-"""Controllers that know the model, and the filters in front of them."""
+"""Model-based controllers, and the filters in front of them."""

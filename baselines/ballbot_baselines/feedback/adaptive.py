@@ -1,12 +1,13 @@
-"""Controllers behind a filter: for robots, delays and sensors that nobody told them.
+"""Controllers behind a filter: for unknown robots, delays and sensors.
 
-`TrackFilter` estimates the state, the robot and the delay, and `SensorFilter` the state of a robot with wheels. A controller
-acts on the state in which its force will begin to act, and asks for what makes up for the share of it that the robot applies.
-NMPC is told the estimated robot too. Where the estimate has moved far from the robot that the episode was planned for, the
-rest of the episode is planned anew, from the present state. That takes longer than a control step. Shortly before a goal a
-new plan may just miss it, and go all the way round. The plan before, which tolerates some error, is followed then.
+`TrackFilter` estimates the state, the robot and the delay. `SensorFilter` estimates the state of a robot with wheels. A
+controller acts on the predicted state at the time when its force starts to act. Its force is divided by the estimated share
+of a force that the robot applies. NMPC uses the estimated robot as its model too. If the estimate moves far from the robot
+that the episode was planned for, the rest of the episode is planned again from the present state. That takes longer than a
+control step. Shortly before a goal a new plan may just miss it and go all the way round. Then the previous plan, which
+tolerates some error, is followed.
 
-What friction the floor has is not seen before the robot slips, so plans take the least of the track.
+The friction of the floor cannot be measured before the robot slips, so plans assume the lowest friction of the track.
 """
 
 import contextlib
@@ -22,7 +23,7 @@ from ballbot_gym.robot import TRACKS, Robot
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 
-_MOVED = 0.02  # of a factor of the robot, and at least twice its deviation: then the episode is planned anew
+_MOVED = 0.02  # change of a factor, and at least twice its deviation, after which the episode is planned again
 _LATER = 1.0  # s by which plans that go all the way round to a goal end later, and are not followed
 _NOISY_BACKOFF = Backoff(margin=0.03, goal=0.2, force=0.02, grip=0.1)  # with room for errors of the estimate
 
@@ -35,10 +36,10 @@ _TRACKS = {
 
 
 class FilteredController:
-    """A controller that acts on what `filter` estimates, which is the filter that one of `FILTERS` names.
+    """A controller that acts on the estimates of `filter`, one of the filters in `FILTERS`.
 
-    With wheels "-ekf" makes the state from sensors. Every other filter knows what may vary on a track, and how far. Then it
-    acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
+    For robots with wheels "-ekf" estimates the state from sensors. Every other filter uses the ranges of what varies on its
+    track. It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
     """
 
     def __init__(self, task: Task, params: Robot, ending: str, controller: Controller):
@@ -66,7 +67,7 @@ class FilteredController:
         self._controller.reset(self._when_free(t), self.filter.when_free(), self._c)
 
     def _adapt(self, t: float) -> None:
-        """Tells the controller what is known now of the robot."""
+        """Passes the present estimates of the robot to the controller."""
         if getattr(self._controller, "told", None) is not None:
             self._controller.told = self.filter.factors  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -1,17 +1,17 @@
-"""Extended Kalman filters: for what a track does not tell, and for the state of a robot with wheels from its sensors.
+"""Extended Kalman filters: for the hidden parameters of a track, and for the state of a robot with wheels from its sensors.
 
 `TrackFilter` estimates z = (x, factors of body mass, height of the centre of mass and force, odometry's drift, biases of
-leans and of lean rates), which is 17 numbers, on a track that varies them. Its model is the env's control step, and its
-Jacobian is CasADi's. What sensors report is linear in z. How far each number may be from what is expected, and how noisy
-sensors are, is the track's: a number that the track does not vary stays what it is.
+leans and of lean rates), which is 17 numbers, on a track that varies them. Its model is the env's control step, and CasADi
+computes the Jacobian. The sensor readings are linear in z. The track gives the initial variance of each number and the
+noise of the sensors. A number that the track does not vary stays constant.
 
-A delay is whole control steps, so there is one filter for each delay that the track may draw. The one whose predictions were
-likeliest is believed.
+Delays are whole control steps, so there is one filter for each delay that the track may draw. The estimates are those of the
+filter with the likeliest predictions.
 
-`SensorFilter` estimates the state and the gyroscope's biases, which is 14 numbers, from what
-`ballbot_gym.robot.sensors` shows.
-Readings are of a control step as a whole, so they correct the state in which the step began, and from there the model goes
-on. Before the first of them the filter expects what the task draws, at the place where the episode begins.
+`SensorFilter` estimates the state and the gyroscope's biases, which is 14 numbers, from the readings of
+`ballbot_gym.robot.sensors`. Readings are means over a whole control step. So they correct the state at the start of the step,
+and the model then predicts the state at its end. Before the first reading the filter assumes the mean and the deviations of
+the task's initial states, at the start position of the episode.
 """
 
 from functools import lru_cache
@@ -37,7 +37,7 @@ _EVIDENCE = 3.0  # of a longer delay over a shorter one, as a difference of log-
 
 
 class TrackFilter:
-    """Estimates what a track does not tell, from reported states and commanded forces, in one episode or in B at once.
+    """Estimates the hidden parameters of a track from reported states and commanded forces, in one episode or in B at once.
 
     | attribute | shape | meaning |
     |---|---|---|
@@ -50,9 +50,7 @@ class TrackFilter:
 
     def __init__(self, task: Task, params: Robot, track: Randomization):
         if not params.TRACK_FILTERS:
-            raise ValueError(
-                "what a track does not tell is not estimated of a robot with wheels; give lqr, trajopt or nmpc"
-            )
+            raise ValueError("filters for tracks do not support robots with wheels; give lqr, trajopt or nmpc")
         self._params, self._track, self._dt = params, track, task.control_dt
         low, high = track.delay_steps(task.control_dt)
         self._delays = np.arange(low, high + 1)
@@ -63,7 +61,7 @@ class TrackFilter:
         self._noise = np.diag(np.maximum(track.noise, _LEAST_NOISE)) ** 2
 
     def reset(self, x: np.ndarray, c: np.ndarray | None = None) -> None:
-        """Starts an episode, of which sensors report state x (8,) at first, or B episodes (B, 8); c does not matter."""
+        """Starts an episode whose first sensor reading is state x (8,), or B episodes (B, 8). It ignores c."""
         one_for_each = (*x.shape[:-1], len(self._delays))
         calls = -(-int(np.prod(one_for_each)) // LANES)
         count = calls * LANES
@@ -188,7 +186,7 @@ _KNOWN = 1e-3  # standard deviation of what they all share, SI units
 class SensorFilter:
     """Estimates the state `x` (11,) of a robot with wheels from its sensors and the forces of its wheels.
 
-    The robot and its delay are known: `factors` and `delay` are as of a `TrackFilter` that has nothing to estimate.
+    The robot and its delay are known: `factors` and `delay` are those of a `TrackFilter` that has nothing to estimate.
 
     | attribute | shape | meaning |
     |---|---|---|
@@ -212,7 +210,7 @@ class SensorFilter:
         self._noise = np.diag(self.reading_variance)
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
-        """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
+        """Starts an episode with constants c (nc,), whose first observation is `seen` (no,)."""
         mean, deviations = self.expected_start(c)
         self._z, self._p = np.concatenate([seen[9:11], mean[2:]]), np.diag(deviations) ** 2
         found, slopes = self.model(self._z[:11], np.zeros(3))

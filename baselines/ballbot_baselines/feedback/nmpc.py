@@ -52,7 +52,7 @@ class _Counts:
     | `steps` | calls of `act` before the plan's end |
     | `iterations` | quadratic programs that were solved |
     | `failed` | steps whose program had no solution, which followed the last plan under TVLQR |
-    | `replans` | whole plans made anew because a first-exit goal was missed at the plan's end |
+    | `replans` | whole plans that were made again because a first-exit goal was missed at the plan's end |
     """
 
     steps: int = 0
@@ -118,7 +118,7 @@ class NmpcController:
         self._before: tuple[np.ndarray, np.ndarray] | None = None
 
     def adapt(self, params: Robot) -> None:
-        """Goes on with the model of another robot of the same kind. The plan stays."""
+        """Continues with the model of another robot of the same kind. The plan stays."""
         self._params = params
 
     def _follow(self, t: float, x: np.ndarray, c: np.ndarray) -> None:

@@ -3,7 +3,7 @@
 The search is that of `search.py`, for all episodes together:
 
 - Where a task ends at rest, only its first seconds are optimized, with LQR's cost-to-go as the cost of their last state, and
-  then LQR is simulated to the end. Where that costs something else than LQR's cost-to-go, the whole episode is optimized.
+  then LQR is simulated to the end. If its actual cost differs from LQR's cost-to-go, the whole episode is optimized.
 - Tasks that end at rest without obstacles start from the cheapest simulated recovery (`righting.steering`).
 - Slaloms are first solved without their obstacles. That predicts what every choice of sides costs (`sides.py`), and the
   likely ones are compared with forces held longer. The best is tried again, passing all obstacles a step later and earlier.
@@ -151,7 +151,7 @@ class _Batch:
     def _given(self, of: np.ndarray, steps: int, c: np.ndarray | None = None, free_time: bool = False) -> np.ndarray:
         """Parameters of `ilqr`, (J, np), of episodes `of` (J,), or with other constants (B, nc).
 
-        LQR's cost-to-go counts where so many control steps end before the episode does.
+        LQR's cost-to-go is added if `steps` control steps end before the episode does.
         """
         c = (self._c if c is None else c)[of]
         _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
@@ -219,8 +219,8 @@ class _Batch:
     ) -> np.ndarray:
         """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,).
 
-        After guesses that end early, LQR goes on. Where that costs something else than its cost-to-go, the whole episode is
-        solved from there.
+        After guesses that end early, LQR continues. If its actual cost differs from its cost-to-go, the whole episode is
+        solved with this motion as the guess.
         """
         if not len(guesses.of):
             return np.zeros(0)
@@ -297,7 +297,7 @@ class _Batch:
         return x, u / self._params.force_limit
 
     def _paths(self, rows: np.ndarray) -> tuple[list[int], list[np.ndarray]]:
-        """Guessed paths, and of which episodes."""
+        """The index of the episode of each guessed path, and the paths."""
         of, paths = [], []
         for i in rows.tolist():
             some = self._task.guess_paths(self._x0[i], self._c[i], self._params)[:CONSIDERED]
@@ -431,7 +431,7 @@ class _Batch:
 
 
 def _shifted(values: np.ndarray, later: int) -> np.ndarray:
-    """(J, n, k) values, each so many steps later; the first or last ones are repeated."""
+    """(J, n, k) values, each shifted by `later` steps; the first or last ones are repeated."""
     n = values.shape[1]
     return values[:, np.clip(np.arange(n) - later, 0, n - 1)]
 

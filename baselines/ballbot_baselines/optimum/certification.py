@@ -35,10 +35,10 @@ def entries(
     robot: str | Robot = PAPER,
     randomization: Randomization = Randomization(),
 ) -> Iterator[tuple[int, EvaluationSet | str]]:
-    """Solves episodes of a task: yields the number of each, and a set of it alone with its optimum, or why none was found.
+    """Solves episodes of a task. Yields the number of each, and a set of it alone with its optimum, or the cause of failure.
 
-    If the robot's friction is limited or the robot varies, an episode without an optimum is drawn again: some starts make the
-    robot slip whatever it does, and only the search tells which.
+    If the robot's friction is limited or the robot varies, an episode without an optimum is drawn again: from some starts the
+    robot slips with any force, and only the search can find out which starts these are.
 
     Args:
         task: the problem, or its name in `TASKS`.
@@ -119,7 +119,7 @@ def optimum_of(
         c: (nc,) constants.
         randomization: without an actuator that lags; noise and pushes move no optimum.
         drawn: what its `draw` drew.
-        twice: as of `find_optimum`, where no force is late.
+        twice: same as in `find_optimum`, used if no force is late.
 
     Raises:
         PlanError: the robot violates a limit before it can be moved, or no try came to an optimum.

@@ -157,9 +157,9 @@ def _cheaper(episode: Shooting, found: Optimum, cost: float) -> list[Solution]:
 def plan_to_track(
     task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
 ) -> Optimum:
-    """As `find_optimum`, for feedback to track. Where no plan keeps the whole reserve of force and friction, it keeps less.
+    """As `find_optimum`, for feedback to track. If no plan keeps the whole reserve of force and friction, it keeps less.
 
-    Args: as of `find_optimum`.
+    Args: those of `find_optimum`.
 
     Raises:
         PlanError: no try came to a feasible episode.

@@ -1,4 +1,4 @@
-"""The regret of any trajectory, whoever made it: what it costs over the optimum from its own start."""
+"""The regret of any trajectory, by any controller: its cost minus that of the optimum from the same start."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

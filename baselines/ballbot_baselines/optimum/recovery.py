@@ -1,4 +1,4 @@
-"""The recoverable states: those from which some force within the limit still brings the robot to rest.
+"""The recoverable states: some force within the limit still brings the robot from them to rest.
 
 No controller can recover from any other state. One component of the initial state (a speed, for example) is given, and all
 others but the lean γ are zero. The largest recoverable lean is then the solution of an optimal-control problem:
@@ -35,7 +35,7 @@ _PATIENCE = 3  # the search stops after this many values in a row without a reco
 
 
 def largest_leans(task: Task, params: Robot, component: int, values: np.ndarray) -> np.ndarray:
-    """For each value of one component of the initial state, the largest lean γ from which the goal can be reached.
+    """For each value of one component of the initial state, the largest lean γ that still allows the robot to reach the goal.
 
     Args:
         task: without constants and with a goal at its end, as Stabilize.

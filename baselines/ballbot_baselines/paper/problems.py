@@ -2,7 +2,7 @@
 
 "High lean angle trajectory optimization for ball balancing robots", equations (2) to (4): direct collocation with a free
 time step, costs summed over knots and not multiplied by the step, and a final-time cost S·h·N in every summand. The paper's
-experiments follow in simulation: its plans under feedback, and LQR beside trajectory optimization.
+experiments follow in simulation: its plans under feedback, and LQR compared with trajectory optimization.
 """
 
 from collections.abc import Callable

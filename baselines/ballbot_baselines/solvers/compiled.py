@@ -49,7 +49,7 @@ def in_lanes(
 ) -> tuple[casadi.Function, ...]:
     """The same functions of `LANES` stages at once, which SIMD instructions compute: a column for each stage.
 
-    Args: as of `compiled`; arguments and results are dense columns. `flags` are the compiler's.
+    Args: those of `compiled`. Arguments and results are dense columns. `flags` are the compiler's.
 
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
@@ -72,7 +72,7 @@ class InPlace:
     def __call__(self) -> bool:
         """Whether it ran without an error."""
         buffer = self._buffer
-        # HPIPM's interface uses up the pointers it is given (seen in CasADi 3.8.2), so they are given anew.
+        # HPIPM's interface changes the pointers that it is given (seen in CasADi 3.8.2), so they are set before each call.
         # The type stubs ask for a size, but memory views bring their own.
         for i, view in enumerate(self._inputs):
             buffer.set_arg(i, view)  # pyright: ignore[reportCallIssue]

@@ -53,7 +53,7 @@ def check_formulas(task: Task, params: Robot) -> None:
                 if _breaks(one, slope):
                     raise ValueError(
                         f"{task.id}: {name} {what} near {start}, and optimizers need slopes that change gradually. Blend "
-                        "steps over some width, and write sqrt(d² + w²) in place of |d|"
+                        "steps over some width, and write sqrt(d² + w²) instead of |d|"
                     )
 
 
@@ -74,8 +74,8 @@ def _along(
 
 
 def _breaks(values: np.ndarray, slopes: np.ndarray) -> bool:
-    """Whether a quantity changes between two points by more than its slopes tell."""
-    told = 0.5 * (slopes[:, 1:] + slopes[:, :-1]) / (values.shape[1] - 1)
-    off = np.abs(np.diff(values) - told)
+    """Whether a quantity changes between two points by more than its slopes explain."""
+    expected = 0.5 * (slopes[:, 1:] + slopes[:, :-1]) / (values.shape[1] - 1)
+    off = np.abs(np.diff(values) - expected)
     allowed = _SMOOTH * np.ptp(values, axis=1, keepdims=True) + 1e-9 * (1 + np.abs(values[:, 1:]))
     return bool((np.isfinite(off) & (off > allowed)).any())

@@ -19,7 +19,7 @@ def along_path(
     Args:
         path: (..., n+1, 2) ball positions, m, one every dt s.
         dt: s, one or (...,).
-        start: (..., 8) the true initial states, put in place of the first guessed ones.
+        start: (..., 8) the true initial states, which replace the first guessed ones.
 
     Returns:
         x: (..., n+1, 8) and u: (..., n, 2), clipped to the force limit.

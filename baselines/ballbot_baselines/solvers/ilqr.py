@@ -5,11 +5,11 @@ dynamics. Then each iteration sweeps backwards with the box-constrained Riccati 
 differential dynamic programming" (2014), and simulates the new feedback, with a shorter step where that raises the cost.
 
 The other inequalities g ≥ 0 are the task's margins, its goal and the robot's friction. Each costs m·w·f(g/w) with a
-multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), which goes on as a parabola below t = −½ (Ben-Tal
+multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), continued as a parabola below t = −½ (Ben-Tal
 and Zibulevsky, "Penalty/barrier multiplier methods for convex programming problems", 1997). So constraints that are not
 violated yet are felt too, and steps can stay long.
 
-Where a task ends at rest, LQR's cost-to-go can stand for the end of an episode.
+If a task ends at rest, LQR's cost-to-go can replace the last part of an episode.
 """
 
 import ctypes
@@ -87,7 +87,7 @@ class Motions:
 
     @classmethod
     def guessed(cls, of: np.ndarray, steps: np.ndarray, x: np.ndarray, a: np.ndarray) -> "Motions":
-        """Guesses, of which nothing else is known."""
+        """Guesses, without costs or multipliers yet."""
         none = np.zeros((len(of), 0))
         return cls(of, steps, x, a, none, none, np.full(len(of), np.inf), np.zeros(len(of), bool), none, none)
 
@@ -96,7 +96,7 @@ class Motions:
         return Motions(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def put(self, rows: np.ndarray, others: "Motions", which: np.ndarray) -> None:
-        """Puts the motions `which` of others in place of the rows at the same indices."""
+        """Replaces the rows `rows[which]` by the motions `which` of others."""
         for field in fields(self):
             getattr(self, field.name)[rows[which]] = getattr(others, field.name)[which]
 
@@ -141,13 +141,15 @@ class _Ilqr:
 
     Raises:
         machine_code.NoMachineCodeError: it cannot be compiled here.
-        NotImplementedError: the task has an operation that `codegen` does not know, or a clock; or the
+        NotImplementedError: the task has an operation that `codegen` does not support, or a clock; or the
             robot has no `BATCHED_OPTIMA`.
     """
 
     def __init__(self, task: Task, params: Robot, free_time: bool = False):
         if task.clock:
-            raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
+            raise NotImplementedError(
+                f"{task.id} has a clock, which batches of optima do not support; use find_optimum"
+            )
         if not params.BATCHED_OPTIMA:
             raise NotImplementedError(
                 f"many optima at once do not support {type(params).__name__}, see Robot.BATCHED_OPTIMA; find_optimum solves "
@@ -211,7 +213,7 @@ class _Ilqr:
             x0: (J, 8) initial states.
             steps: n.
             length: of a step, s.
-            given: as of `solve`.
+            given: same as in `solve`.
             paths: (J, n, 4) where to steer the ball, m, and leans that are added, rad.
             settings: of this feedback, its bandwidth, rad/s, and its time constant, s.
             ends: (J, 8) states about which LQR acts.

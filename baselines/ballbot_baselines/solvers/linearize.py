@@ -37,7 +37,7 @@ def quadratic_cost(
 
     Returns:
         Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any. With wheels Q also has a small
-        weight on the heading, which tasks leave free, because LQR has no gain for what it may leave to itself for ever.
+        weight on the heading. Tasks leave the heading free, and LQR has no gain for a state that may drift at no cost.
     """
     n, states = np.shape(x)
     q, r = _cost_derivatives(task, 2, states, np.shape(u)[1])(
@@ -51,7 +51,7 @@ def quadratic_cost(
 def cost_slopes(
     task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The gradient of the task's cost rate with respect to x (n, 8) and to u (n, 2); arguments as of `quadratic_cost`."""
+    """The gradient of the task's cost rate with respect to x (n, 8) and to u (n, 2); arguments of `quadratic_cost`."""
     along_x, along_u = _cost_derivatives(task, 1, np.shape(x)[1], np.shape(u)[1])(
         np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, len(x))
     )

@@ -70,7 +70,7 @@ _AHEAD, _SHARE = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 
 class _RatesStage(_Stage):
-    """A stage whose result is the state after RK4 steps of given rates, for rates of so many operations that the steps and
+    """A stage whose result is the state after RK4 steps of given rates. It is for rates with many operations: the steps and
     their derivatives, written out, would take minutes to compile.
 
     The chain rule is applied to the derivatives of the rates, which are functions of their own.

@@ -184,7 +184,7 @@ class OcpSolver:
         Args:
             states: (N+1, ns) guess.
             inputs: (N, nw) guess.
-            lower: bounds as of `Ocp.no_bounds`. Equal ones fix a variable, as the initial state's.
+            lower: bounds, same as in `Ocp.no_bounds`. Equal bounds fix a variable, for example the initial state.
             upper: as `lower`.
             p: (np,) parameters.
 
@@ -238,7 +238,7 @@ def _status(solver: str, stats: dict) -> str:
 def _interrupts_kept() -> Iterator[None]:
     """Raises a KeyboardInterrupt at the end of the block if one came within it.
 
-    CasADi prints it and goes on, so that a command would not end, and an interrupted search would pass for one that failed.
+    CasADi prints it and continues, so that a command would not end and an interrupted search would look like a failed one.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

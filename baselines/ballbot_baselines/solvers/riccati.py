@@ -147,8 +147,8 @@ def _feedforward(
 ) -> np.ndarray:
     """(n, 2) forces, N, to add along an open reference that is no motion of the robot, or not the cheapest near it.
 
-    They are those of the cheapest motion in the linear model about the reference, of which LQR's gains are the feedback: the
-    steps by which the reference misses the equations of motion count, and the slopes of the cost.
+    They are the forces of the cheapest motion in the linear model about the reference. LQR's gains are the feedback of the
+    same model. The model includes the errors of the reference in the equations of motion, and the gradients of the cost.
     """
     x, u, dt = reference.x, reference.u, task.control_dt
     a, b, _, r = _steps(task, params, x, u, c, start)

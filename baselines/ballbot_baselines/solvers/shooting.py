@@ -193,7 +193,7 @@ class Shooting:
         """From a guess by one solver, which is made once for all robots of a kind.
 
         Args:
-            x: states; (n+1, 9) with a free length of all intervals, s, which tells roughly when to arrive.
+            x: states; (n+1, 9) with a free length of all intervals, s, which is a rough guess of the time of arrival.
             a: actions.
             coarseness: control steps for which forces are held.
             solver: "fatrop" or "ipopt".
