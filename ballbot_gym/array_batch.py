@@ -102,7 +102,7 @@ class BallbotArrays(BallbotNative):
         if begun.size:
             states = self.params.state_size
             measured = states + len(self.params.MEASUREMENTS)
-            rows[measured : self._told_rows, begun] = 0
+            rows[measured : self._reported_rows, begun] = 0
             steps[begun], episode[begun] = 0, episode[begun] + 1
             x, c[:, begun] = self._drawn(old.seed[begun], episode[begun], None)
             rows[:states, begun] = x

@@ -1,9 +1,9 @@
 """C code of what a task and a robot compute, for many robots at once.
 
 `ops` lets tasks and robots compute with CasADi's symbols. So a step is traced once, and written out as C functions that the
-rest of the code, native.c, calls. They compute blocks of `LANES` robots, a number that compilers know, and make SIMD
-instructions of. So every robot is computed by the same instructions, wherever it stands in a batch of whatever
-size.
+rest of the code, native.c, calls. They compute blocks of `LANES` robots. This number is a constant, so that compilers make
+SIMD instructions of the loops. Every robot is computed by the same instructions, for any size of the batch and any place in
+it.
 """
 
 import math
@@ -76,8 +76,8 @@ def source(task: Task, params: Robot, double: bool) -> str:
         double: whether numbers are float64, else float32.
 
     Raises:
-        NotImplementedError: the task has an operation that is not known here.
-        Exception: whatever a task raises that cannot compute with CasADi's symbols.
+        NotImplementedError: the task has an operation that is not supported here.
+        Exception: any error of a task that cannot compute with CasADi's symbols.
     """
     x, c = _symbols("x", params.state_size), _symbols("c", len(task.constant_names))
     z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)

@@ -104,8 +104,8 @@ class TaskEnv:
 class BallbotEnv(TaskEnv, gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
-    The reward of a step is `task.survival_reward` · control_dt minus the step's cost. A failure ends the episode, and its last
-    step costs survival_reward for every remaining second. So return + cost = `task.survival_pay` in every episode, and
+    The reward of a step is `task.survival_reward` · control_dt minus the step's cost. A failure ends the episode, and its
+    last step costs survival_reward for every remaining second. So return + cost = `task.survival_pay` in every episode, and
     maximizing the return minimizes the cost; see `Task`.
 
     `info` has, after `reset` and each `step`:

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 _WINDOWS = sys.platform == "win32"
 SUFFIX = ".dll" if _WINDOWS else ".so"
 _FLAGS = ("-shared",) if _WINDOWS else ("-fPIC", "-shared")
-_NATIVE = "-march=native"  # some compilers do not know it for some processors, such as clang for ARM
+_NATIVE = "-march=native"  # some compilers do not support it for some processors, such as clang for ARM
 _LIBRARIES = () if _WINDOWS else ("-lm",)
 _DIGITS = 24  # of SHA-256, in the names of libraries
 _COMPILE_SECONDS = 120.0  # after which a compiler counts as hanging
@@ -228,7 +228,7 @@ def _digest(path: Path) -> str:
 
 @cache
 def compiler() -> str | None:
-    """The path of a C compiler; None, and a word in the log, where there is none."""
+    """The path of a C compiler. If there is none, None and a line in the log."""
     path = shutil.which(os.environ.get("CC", "cc")) or shutil.which("gcc") or shutil.which("clang")
     if path is None:
         _log.warning("no C compiler found: environments and optimization are several times slower")

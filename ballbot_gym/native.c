@@ -97,8 +97,8 @@ void ballbot_observe(int64_t B, int64_t count, const int64_t *which, const int64
 /* Robots that a thread takes at once. */
 enum { CHUNK = 32 * LANES };
 
-/* Rows of what is told of a robot: state, measurements, force, the floor's grip. */
-enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, TOLD = GRIPPED + GRIP };
+/* Rows of what is reported of a robot: state, measurements, force, the floor's grip. */
+enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, REPORTED = GRIPPED + GRIP };
 
 /* Rows of flags, which are those of codegen.FLAGS and one more; and of pay. */
 enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
@@ -118,19 +118,19 @@ typedef struct {
     const int64_t *steps, *episode, *seed;
     const uint8_t *idle;     /* whose action is ignored, and whose next episode begins; null where there are none */
     int64_t begins, restarts; /* whether episodes begin; and whether they do where others end */
-    real *told, *seen;       /* TOLD and SEEN rows */
+    real *reported, *seen;   /* REPORTED and SEEN rows */
     double *pay;             /* 5 rows */
     uint8_t *flags;          /* 6 rows */
     int64_t *counts;         /* 3 rows; the last is written where episodes begin, */
     real *new_c;             /* and so is this */
-    float *end_seen;         /* a row for each robot, of which those that end are written; null unless restarts. Else what
-                                ended episodes told is kept too: told has TOLD more rows, pay COST to GOAL again, and flags
-                                SUCCESS to CLIPPED. */
+    float *end_seen;         /* a row for each robot, written where an episode ends; null unless restarts. If it is not
+                                null, the reports of ended episodes are kept too: `reported` then has REPORTED more
+                                rows, pay has COST to GOAL again, and flags has SUCCESS to CLIPPED again. */
 } Memory;
 
-/* Tells the rewards, costs and flags of robots n to n + count - 1. Where count is known, the compiler makes SIMD of it. */
-static inline __attribute__((always_inline)) void tell(const Memory *m, int64_t n, int64_t count, const real *paid,
-                                                       const real *marks, const real *limit) {
+/* Writes the rewards, costs and flags of robots n to n + count - 1. If count is a constant, the compiler makes SIMD of it. */
+static inline __attribute__((always_inline)) void write_outcome(const Memory *m, int64_t n, int64_t count,
+                                                                const real *paid, const real *marks, const real *limit) {
     const int64_t B = m->B;
     double *const pay = m->pay + n;
     uint8_t *const flags = m->flags + n;
@@ -162,7 +162,7 @@ static inline __attribute__((always_inline)) void tell(const Memory *m, int64_t 
 static void step_block(Memory *m, int64_t n, int64_t count) {
     const int64_t B = m->B;
     const real *const action = m->action + n * m->env;
-    real *const told = m->told + n;
+    real *const reported = m->reported + n;
     real taken[LANES] = {0}, after[LANES] = {0}, acts[ACTIONS * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
     for (int64_t k = 0; k < count; ++k) {
         for (int i = 0; i < ACTIONS; ++i)
@@ -175,21 +175,21 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     if (!(off == 0))
         __atomic_store_n(&m->bad, 1, __ATOMIC_RELAXED);
     if (count == LANES) {
-        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, told, B, told + FORCE * B, B,
-                told + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
-        look(told, B, m->c + n, B, after, LANES, m->seen + n, B, told + MEASUREMENTS * B, B);
-        tell(m, n, LANES, paid, marks, limit);
+        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, reported, B, reported + FORCE * B, B,
+                reported + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
+        look(reported, B, m->c + n, B, after, LANES, m->seen + n, B, reported + MEASUREMENTS * B, B);
+        write_outcome(m, n, LANES, paid, marks, limit);
     } else {
-        real in[(STATES + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
-        real *const cs = in + STATES * LANES, *const ss = out + TOLD * LANES;
+        real in[(STATES + CONSTANTS) * LANES] = {0}, out[(REPORTED + SEEN) * LANES];
+        real *const cs = in + STATES * LANES, *const ss = out + REPORTED * LANES;
         rows_copy(STATES, count, m->x + n, B, in, LANES);
         rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
         advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
                 out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
         look(out, LANES, cs, LANES, after, LANES, ss, LANES, out + MEASUREMENTS * LANES, LANES);
-        rows_copy(TOLD, count, out, LANES, told, B);
+        rows_copy(REPORTED, count, out, LANES, reported, B);
         rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
-        tell(m, n, count, paid, marks, limit);
+        write_outcome(m, n, count, paid, marks, limit);
     }
 }
 
@@ -208,7 +208,7 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
     rows_copy(CONSTANTS, size, m->c + first, B, m->new_c + first, B);
     memcpy(episode + first, m->episode + first, size * sizeof *episode);
     if (m->restarts) {
-        rows_copy(TOLD, size, m->told + first, B, m->told + TOLD * B + first, B);
+        rows_copy(REPORTED, size, m->reported + first, B, m->reported + REPORTED * B + first, B);
         for (int i = COST; i <= GOAL; ++i)
             memcpy(m->pay + (i + GOAL) * B + first, m->pay + i * B + first, size * sizeof *m->pay);
         for (int i = SUCCESS; i <= CLIPPED; ++i)
@@ -227,13 +227,13 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
         } else {
             continue;
         }
-        CLEAR(TOLD - FORCE, m->told + FORCE * B);
+        CLEAR(REPORTED - FORCE, m->reported + FORCE * B);
         steps[n] = 0;
         episode[n] += 1;
         begun[count++] = n;
     }
-    ballbot_start(B, count, begun, m->seed, episode, 0, m->told, m->new_c);
-    ballbot_observe(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + MEASUREMENTS * B);
+    ballbot_start(B, count, begun, m->seed, episode, 0, m->reported, m->new_c);
+    ballbot_observe(B, count, begun, steps, m->reported, m->new_c, m->seen, m->reported + MEASUREMENTS * B);
 }
 
 /* One control step of a batch. Threads that call it with the same memory take chunks in turns, until all are done. */

@@ -1,8 +1,8 @@
 """BallbotNative: what `BallbotBatch` does without gradients, in machine code that is compiled once per task and robot.
 
 `codegen` writes the C code, `machine_code` compiles it within a second or two, and it serves batches of all sizes. Episodes
-are those of `BallbotBatch`: the same `counter_rng` numbers for the same seeds. Motions agree to rounding, and are
-bit-identical wherever an env stands in whatever batch.
+are those of `BallbotBatch`: the same `counter_rng` numbers for the same seeds. Motions agree to rounding. They are
+bit-identical for any size of the batch and any place of the env in it.
 """
 
 import ctypes
@@ -81,7 +81,9 @@ class BallbotNative:
         self._code = code or _code(task, params, dtype is np.float64)
         self._all = np.arange(self.num_envs)
         self._seen_rows = task.observation_size(params)
-        self._told_rows = params.state_size + len(params.MEASUREMENTS) + params.action_size + (4 if params.grips else 0)
+        self._reported_rows = (
+            params.state_size + len(params.MEASUREMENTS) + params.action_size + (4 if params.grips else 0)
+        )
         size, nothing = self.num_envs, np.zeros((0, self.num_envs), dtype)
         x, c = (np.zeros((rows, size), dtype) for rows in (params.state_size, len(task.constant_names)))
         seeds = np.array(seeds_of(int(np.random.SeedSequence().generate_state(1)[0]), size))
@@ -168,7 +170,7 @@ class BallbotNative:
         ended = flags[5].nonzero()[0]
         now, end = self._info(self._state, rows, pay[1:5], flags[2:5], violated), None
         if restarts and ended.size:
-            rows = rows[self._told_rows :]
+            rows = rows[self._reported_rows :]
             end = self._info(old._replace(x=rows[: self.params.state_size]), rows, pay[5:], flags[6:], violated)
             last = last.take(ended, 0)
         return step_result(observation, pay[0], flags[0], flags[1], now, end, last)
@@ -180,7 +182,7 @@ class BallbotNative:
             actions = actions.copy()
         apart = (stride // actions.itemsize for stride in actions.strides)
         if actions.flags.f_contiguous:
-            actions = actions.T  # the same memory, in the order that `_pointer` likes
+            actions = actions.T  # the same memory, in the order that `_pointer` needs
         read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
         idle = 0 if waiting is None else _pointer(waiting)
         written = self.restarts or waiting is not None, self.restarts, *_pointers(*made)
@@ -193,7 +195,7 @@ class BallbotNative:
         size, kept, kinds = self.num_envs, int(restarts), (self.dtype, np.float64, np.bool_, np.int64, np.float32)
         real, double, truth, whole, single = map(np.dtype, kinds)
         return [
-            ((self._told_rows * (1 + kept), size), real),
+            ((self._reported_rows * (1 + kept), size), real),
             ((self._seen_rows, size), real),
             ((5 + 4 * kept, size), double),
             ((FLAG_ROWS + 3 * kept, size), truth),
@@ -208,7 +210,7 @@ class BallbotNative:
         pulls = measured + len(self.params.MEASUREMENTS)
         grip = pulls + self.params.action_size
         force, (success, failure, clipped) = rows[pulls:grip], flags[:3]
-        did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._told_rows]
+        did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._reported_rows]
         return info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -235,7 +237,7 @@ class _Memory(ctypes.Structure):
         *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "bad", "env", "component")),
         *((name, ctypes.c_void_p) for name in ("x", "c", "action", "steps", "episode", "seed", "idle")),
         *((name, ctypes.c_int64) for name in ("begins", "restarts")),
-        *((name, ctypes.c_void_p) for name in ("told", "seen", "pay", "flags", "counts", "new_c", "end_seen")),
+        *((name, ctypes.c_void_p) for name in ("reported", "seen", "pay", "flags", "counts", "new_c", "end_seen")),
     )
 
 
@@ -257,7 +259,7 @@ def _pointer(array: np.ndarray) -> int:
 def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
     """Raises a NoMachineCodeError unless functions compute the same with CasADi's symbols as with numbers.
 
-    A symbol that is made a float, for one, becomes NaN without a word.
+    For example, a symbol that is converted to a float silently becomes NaN.
     """
     from ballbot_gym.array_batch import BallbotArrays  # a subclass of this module's class
 
@@ -316,7 +318,7 @@ def _code(task: Task, params: Robot, double: bool) -> ctypes.CDLL:
         source = _source(task, params, double)
     except (ImportError, NoMachineCodeError):
         raise
-    except Exception as error:  # whatever code of users raises that meets CasADi's symbols
+    except Exception as error:  # users' code may raise any error when it gets CasADi's symbols
         raise NoMachineCodeError(f"{task.id} cannot be traced: {type(error).__name__}: {error}") from error
     try:
         library = ctypes.CDLL(str(machine_code.library(type(task).__name__.lower(), source, _COMPILER_FLAGS)))

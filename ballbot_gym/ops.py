@@ -96,7 +96,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         return library.if_else(condition, a, b)
     if library.__name__ == "torch":
         kinds = [part.dtype for part in (a, b) if isinstance(part, library.Tensor)]
-        kind = kinds[0] if kinds else library.float32  # whatever torch's default is
+        kind = kinds[0] if kinds else library.float32  # the default of torch
         a, b = (
             library.as_tensor(part, dtype=kind, device=condition.device) if isinstance(part, float) else part
             for part in (a, b)

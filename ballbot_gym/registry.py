@@ -41,7 +41,7 @@ _SHIPPED_ROBOTS = tuple(ROBOTS)
 
 
 def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
-    """Gives a class of tasks a name and its Gymnasium id, under which everything knows it. May decorate the class.
+    """Gives a class of tasks a name and its Gymnasium id, which all commands accept. May decorate the class.
 
     To register a class again, as a notebook does whose cell runs twice, replaces it.
 
@@ -112,8 +112,8 @@ def name_of(task: Task) -> str | None:
 def spec_of(
     spec: EnvSpec | None, task: Task, params: Robot, randomization: Randomization, steps: int | None = None
 ) -> EnvSpec | None:
-    """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
-    was asked for, and without a reward threshold where another problem, robot or pay makes it meaningless.
+    """The spec of an env, from its registered spec: with the env's own number of control steps, and without a reward
+    threshold if another problem, robot or pay makes the threshold meaningless.
 
     Its keywords are such that `to_json` can write them and the env can be made of them again, unless the task is an object
     of a class that is not in `TASKS`.
@@ -138,7 +138,7 @@ def spec_of(
 
 
 def _plain(value: Any) -> Any:
-    """A keyword as JSON knows it, of those that envs take as words or numbers too."""
+    """The value of a keyword in JSON, if envs also take it as a word or a number."""
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, np.generic):

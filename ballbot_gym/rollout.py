@@ -130,14 +130,16 @@ def rollout(
             where the step starts.
 
     Raises:
-        ValueError: the env shows sensors, and the controller wants states.
+        ValueError: the env shows sensors, and the controller needs states.
         Exception: what the controller's `reset` raises, for instance a PlanError where it found no plan.
     """
     ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     senses = ballbot.observation == "sensors"
     if senses and not getattr(controller, "senses", False):
-        raise ValueError(f'{type(controller).__name__} wants states; behind a filter, as "lqr-ekf", it takes sensors')
+        raise ValueError(
+            f'{type(controller).__name__} needs states; give it a filter, for example "lqr-ekf", to control from sensors'
+        )
     observation, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
     seen = observation if senses else sensed(ballbot, x, 0.0)

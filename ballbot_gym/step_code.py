@@ -70,10 +70,10 @@ def motion(params: Robot, dt: float) -> Work | None:
 
 
 class Judge(Work):
-    """What a task says of control steps, in an episode with the constants `c`, which may be set.
+    """Computes the outcomes of control steps of a task, in an episode with the constants `c`, which may be set.
 
-    Of the step that was judged last, `seen` is the (no) observation without noise, `x` the (8,) state after it, and `force`
-    (2,) in N; they are longer with wheels. They are overwritten by the next.
+    After each step `seen` is the (no) observation without noise, `x` the (8,) state after the step, and `force` the (2,)
+    force in N; they are longer with wheels. The next step overwrites them.
     """
 
     def __init__(self, code: Code, task: Task, params: Robot):
@@ -131,18 +131,18 @@ def _code(key: Any, compute: Callable[..., Sequence[Any]], counts: Sequence[int]
     _codes[key] = None
     try:
         _codes[key] = _checked(compute, counts, in_place)
-    except Exception as error:  # no compiler or cache, or whatever code of users raises that meets a traced number
+    except Exception as error:  # no compiler or cache, or any error of users' code that gets a traced number
         _log.info("%s stays in Python: %s: %s", key, type(error).__name__, error)
     return _codes[key]
 
 
 def _checked(compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_place: bool) -> Code:
-    """The code of a function, once it has given the bits that Python gives.
+    """The code of a function, after a check that its results are bit-identical to Python's.
 
     Raises:
-        ArithmeticError: it does not.
+        ArithmeticError: they are not.
         NoMachineCodeError: see `machine_code.library`.
-        Exception: whatever compute raises that cannot compute with traced numbers.
+        Exception: any error of a `compute` that cannot compute with traced numbers.
     """
     source = traced.function("compute", compute, counts, in_place)
     call = ctypes.PyDLL(

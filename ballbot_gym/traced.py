@@ -97,7 +97,7 @@ def function(name: str, compute: Callable[..., Sequence[Any]], counts: Sequence[
         in_place: whether the results replace the first arguments.
 
     Raises:
-        Exception: whatever compute raises that cannot compute with a `Number`.
+        Exception: any error of a `compute` that cannot compute with a `Number`.
     """
     lines: dict[str, str] = {}
     given = [Number(f"a{i}", lines) for i in range(sum(counts))]

@@ -1,6 +1,6 @@
-"""A robot and a task that the packages do not know: a cart-pole, and its swing-up.
+"""A robot and a task that are not part of the packages: a cart-pole, and its swing-up.
 
-Importing this file registers both. Then everything that ballbots have works here too:
+Importing this file registers both. Then all commands for ballbots work here too:
 
     ballbot benchmark --task examples.cart_pole:swing_up --robot examples.cart_pole:cart_pole --controllers trajopt nmpc
 """

@@ -132,7 +132,7 @@ def test_lqr_behind_the_filter_comes_to_rest_from_sensors_alone():
         off = np.abs(controller.filter.x - episode.trajectory.x[-2])
         assert off[2:4].max() < 3e-3  # rad; 1e-3 is usual
         assert off[:2].max() < 0.02  # m
-    with pytest.raises(ValueError, match="wants states"):
+    with pytest.raises(ValueError, match="needs states"):
         rollout(env, make_controller("lqr", env.task, env.params))
 
 

@@ -62,7 +62,7 @@ class EvaluationSet:
     | ideal | (n,) | optimal costs if forces came without delay |
 
     Where a randomization moves the optima, each is that of the episode's own robot, and its first forces are 0 for as long as
-    the episode's forces are delayed. Episodes whose optima were not asked for, of a set in the user's cache, are NaN.
+    the episode's forces are delayed. In a set of the user's cache, episodes whose optima were not computed are NaN.
     """
 
     states: np.ndarray
@@ -204,9 +204,9 @@ def _version(path: Path) -> tuple[Path, int, int]:
 def _read(
     versions: tuple[tuple[Path, int, int], ...], task: Task, params: Robot, randomization: Randomization
 ) -> EvaluationSet:
-    """The sets of some files in their present versions as one. Of several files each has all its trajectories.
+    """The sets of some files in their present versions as one. If there are several, each file has all its trajectories.
 
-    The trajectories must hold; they are stepped once, however often the set is asked for.
+    The trajectories are checked by stepping them; this is done once for every set of files.
     """
     parts = [_arrays_of(path, task, params, randomization) for path, _, _ in versions]
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

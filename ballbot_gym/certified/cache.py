@@ -113,7 +113,7 @@ def _formulas(task: Task, params: Robot) -> str:
     counts = (8, 2, constants + task.clock, task.constant_draws, task.state_draws)
     try:
         return traced.function("problem", compute, counts)
-    except Exception:  # whatever code of users raises that meets a traced number
+    except Exception:  # users' code may raise any error when it gets a traced number
         kinds = [kind for kind in type(task).__mro__ if issubclass(kind, Task) and kind is not Task]
         try:
             return "".join(map(inspect.getsource, kinds))

@@ -1,7 +1,7 @@
 """What a picture of ballbots shows, as plain data that every renderer draws: robots, ghosts, markers, paths and forces.
 
-A `Drawing` is one moment. Films, strips of pictures and live pages draw one after the other. Nothing here knows a library
-that draws.
+A `Drawing` is one moment. Films, strips of pictures and live pages draw one after the other. Nothing here
+depends on a graphics library.
 """
 
 import math
@@ -17,7 +17,7 @@ from ballbot_gym.tasks.marker import Marker
 BALL = DARK
 """Colour of the ball."""
 BODY = "#d97706"
-"""Colour of a body that stands for no controller."""
+"""Colour of a body without a controller."""
 FORCE = "#d91a8c"
 """Colour of the force's arrow."""
 PUSH = "#1a9e5c"

@@ -86,7 +86,7 @@ class BulletSimulator(Simulator):
         with tempfile.TemporaryDirectory() as folder, _loading:
             path = Path(folder) / "ballbot.urdf"
             path.write_text(urdf_text(params), encoding="utf-8")
-            # Bullet reads numbers by the process's locale: with decimal commas it would take "0.5" for 0 without a word.
+            # Bullet reads numbers by the process's locale: with decimal commas it would silently take "0.5" for 0.
             found = locale.setlocale(locale.LC_NUMERIC)
             locale.setlocale(locale.LC_NUMERIC, "C")
             try:
@@ -139,7 +139,7 @@ class BulletSimulator(Simulator):
 class BulletContactSimulator(BulletSimulator):
     """The URDF of a robot whose ball rolls in PyBullet, on a floor: the ball may slip, and leave the floor.
 
-    The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
+    The force u represents the torque r e_z × u from the body on the ball, which is held over the control step.
     """
 
     def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
@@ -217,7 +217,7 @@ class BulletContactSimulator(BulletSimulator):
     def _set_surface(self, body: int, link: int, friction: float) -> None:
         """Friction as given, and nothing else that acts at a contact."""
         none = {"rollingFriction": 0, "spinningFriction": 0, "restitution": 0, "physicsClientId": self._client}
-        # A call that sets damping too would drop lateralFriction without a word.
+        # A call that sets damping too would silently drop lateralFriction.
         self._bullet.changeDynamics(body, link, lateralFriction=friction, **none)
         found = self._bullet.getDynamicsInfo(body, link, physicsClientId=self._client)[1]
         if not math.isclose(found, friction, rel_tol=1e-6):

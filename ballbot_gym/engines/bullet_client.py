@@ -1,4 +1,4 @@
-"""PyBullet where it is installed, imported without a word."""
+"""PyBullet if it is installed, imported without its output."""
 
 import ctypes
 import os

@@ -12,7 +12,7 @@ from ballbot_gym.lazy import imports_of
 from ballbot_gym.robot import omni
 
 _PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
-_ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo wants a mass of whatever moves
+_ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo requires a mass of every moving body
 _BODY, _BALL = 2, 3  # after the world and the hub, in the order in which they are added
 _LEANS = (((0, 1, 0), "gamma"), ((-1, 0, 0), "theta"))
 
@@ -117,7 +117,7 @@ class MujocoSimulator(Simulator):
 class MujocoContactSimulator(MujocoSimulator):
     """A robot whose ball rolls in MuJoCo, on a floor: the ball may slip, and leave the floor.
 
-    The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
+    The force u represents the torque r e_z × u from the body on the ball, which is held over the control step.
     """
 
     _places = (0, 1, 3, 4)  # z is third, the ball's turn last
@@ -182,7 +182,7 @@ class MujocoContactSimulator(MujocoSimulator):
     def step(self, u: tuple[float, ...]) -> State:
         """Takes MuJoCo's steps one by one.
 
-        MuJoCo's friction wants to stop a slip within solreffriction, and its convex cone lifts the ball off the floor where
+        MuJoCo's friction stops a slip within solreffriction, and its convex cone lifts the ball off the floor where
         friction is too weak for that. So friction is given the time that it needs under the robot's weight.
         """
         twisted, radius = self._twisted, self._params.ball_radius

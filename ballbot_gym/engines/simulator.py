@@ -18,7 +18,7 @@ class Simulator(Protocol):
     """One robot whose action is held over control steps."""
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
-        """Puts the robot into state x, and whatever else an engine remembers into what `memory` gave."""
+        """Puts the robot into state x, and restores the internal state of the engine that `memory` returned."""
 
     def set_params(self, params: Robot) -> None:
         """Replaces the robot by one of the same kind; call `reset` after it."""

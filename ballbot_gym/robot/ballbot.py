@@ -55,7 +55,7 @@ class Ballbot(_Derived, Robot):
     | inertia, axial_inertia | of the body about its centre of mass, across and along its axis | kg·m² |
     | force_limit | largest force on the ball along each axis | N |
     | gravity | | m/s² |
-    | friction | coefficient between ball and floor; inf for a floor that gives whatever force is needed | |
+    | friction | coefficient between ball and floor; inf for a floor that gives any force | |
 
     Raises:
         ValueError: a field is no number, or not positive and finite; the message names it.
@@ -97,7 +97,7 @@ class Ballbot(_Derived, Robot):
     def __post_init__(self) -> None:
         super().__post_init__()
         if is_number(self.inertia) and is_number(self.axial_inertia) and self.axial_inertia > 2 * self.inertia:
-            # Bullet would take 0 for both, without a word
+            # Bullet would silently take 0 for both
             raise ValueError(
                 f"{type(self).__name__}: axial_inertia must be at most twice inertia, not {self.axial_inertia}"
             )

@@ -160,7 +160,7 @@ class Omni(RollingBall):
         return solved(*equations(self, x, u))
 
     def floor_force(self, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> FloorForce:
-        """Whatever drives the robot, the floor's force moves the whole of it."""
+        """The floor's force is the only external force on the whole robot, besides its weight."""
         _, _, gamma, theta, _, _, gamma_dot, theta_dot, *_ = ops.components(x)
         ax, ay, gamma_ddot, theta_ddot, *_ = acceleration
         sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)

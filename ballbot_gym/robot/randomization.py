@@ -41,7 +41,7 @@ class Randomization:
     inertia: Range = (1.0, 1.0)
     """Factor on both of the body's inertias about its centre of mass, drawn per episode."""
     force: Range = (1.0, 1.0)
-    """Factor on the force that the actuator applies when it is asked for one, drawn per episode."""
+    """Ratio of the applied force to the command, drawn per episode."""
     friction: Range = (1.0, 1.0)
     """Factor on the coefficient of friction, where it is limited, drawn per episode."""
     actuator_lag: Range = (0.0, 0.0)
@@ -109,7 +109,7 @@ class Randomization:
 
     @property
     def varies_actuator(self) -> bool:
-        """Whether the force lags, is delayed, or is another than was asked for."""
+        """Whether the force lags, is delayed, or differs from the command."""
         return self.actuator_lag[1] > 0 or self.actuator_delay[1] > 0 or self.force != (1.0, 1.0)
 
     @property
@@ -129,7 +129,7 @@ class Randomization:
 
     @property
     def moves_optima(self) -> bool:
-        """Whether an episode's optimum is another than that of the nominal robot with an ideal actuator."""
+        """Whether an episode's optimum differs from that of the nominal robot with an ideal actuator."""
         return self.varies_robot or self.varies_actuator
 
     @property
@@ -214,7 +214,7 @@ class Randomization:
         """The force (2), N, that the actuator applies in the next control step, and its new memory.
 
         Args:
-            command: (2,) N, asked for now.
+            command: (2,) N, of the present control step.
             drawn: what `draw` drew for the episode.
             memory: (2,) N, applied in the last control step, and (2 d) the commands before, the latest first, of as many
                 steps d as the longest delay.

@@ -6,12 +6,12 @@ Point = tuple[float, float, float]
 """x, y and z, m; the floor is z = 0."""
 
 DARK = "#292e3b"
-"""Colour of parts that have the same colour whatever drives the robot, such as a ball."""
+"""Colour of parts, such as a ball, that do not have the colour of the controller."""
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere. Without a colour "#rrggbb" it has that of the controller that is shown."""
+    """A sphere. Without a colour "#rrggbb" it has the colour of the controller that is shown."""
 
     centre: Point
     radius: float
@@ -20,7 +20,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A cylinder about the line from one point to another. Without a colour it has that of the controller that is shown."""
+    """A cylinder about the line from one point to another. Without a colour it has the controller's colour."""
 
     start: Point
     end: Point

@@ -1,7 +1,7 @@
-"""Experts that know the model: linear control, trajectory optimization, and the optima that regret is measured against.
+"""Model-based experts: linear control, trajectory optimization, and the optima that regret is measured against.
 
 `from ballbot_baselines import find_optimum` and the like are short paths to what users need. Importing this package is light:
-CasADi and SciPy are imported when one of them is first asked for, or a controller is made.
+CasADi and SciPy are imported at the first use of one of these names, or when a controller is made.
 """
 
 from collections.abc import Callable

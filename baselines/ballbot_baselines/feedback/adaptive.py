@@ -57,7 +57,7 @@ class FilteredController:
             self.filter.update(t - self._start, x, self._u)
             self._adapt(t)
         limit = self._params.force_limit
-        # the robot applies a share of what it is asked for
+        # the robot applies only a share of the command
         u = self._controller.act(self._when_free(t), self.filter.when_free()) / self.filter.factors[..., 2:]
         self._u = np.clip(u, -limit, limit)
         return self._u

@@ -111,7 +111,7 @@ class TrackFilter:
         return -0.5 * (whitened + np.linalg.slogdet(spread)[1])
 
     def _believed(self, each: np.ndarray) -> np.ndarray:
-        """What the believed filter has of what each filter has (..., filters, n)."""
+        """The values of the likeliest filter, from the values (..., filters, n) of all filters."""
         return np.take_along_axis(each, self._best[..., None, None], -2)[..., 0, :]
 
     @property

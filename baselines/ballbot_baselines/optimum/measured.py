@@ -57,7 +57,7 @@ def regret(
     Args:
         trajectory: a Trajectory, or arrays (t, x, u): t (N+1,) s, at any increasing times; x (N+1, 8) states, order and units
             in `Ballbot.STATE`; u (N, 2) N, each held until the next time, or (N+1, 2), linear between times. It may begin
-            at any time, and go on after the episode's end.
+            at any time, and continue after the episode's end.
         task: a name in `TASKS`, or any Task.
         robot: a name in `ROBOTS`, or any Robot.
         constants: (nc,) of the episode, named in the task's `constant_names`.

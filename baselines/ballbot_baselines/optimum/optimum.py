@@ -52,7 +52,7 @@ class Optimum(Moving):
     slopes: np.ndarray
     markers: tuple[Marker, ...] = ()
     feedback: Callable[[], np.ndarray] = _no_feedback
-    """Computes `gains`, which takes as long as a part of the search; so it is called when they are first asked for."""
+    """Computes `gains`. It takes as long as a part of the search, so it is called at the first use of `gains`."""
 
     @classmethod
     def of(cls, solution: Solution, trajectory: Trajectory, seconds: float, **more: Any) -> "Optimum":

@@ -56,7 +56,7 @@ def in_lanes(
     """
     try:
         found = _loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, flags)
-    except NotImplementedError:  # an operation that only CasADi knows as C
+    except NotImplementedError:  # an operation that only CasADi can write as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)
     return found or tuple(function.map(LANES) for function in functions)

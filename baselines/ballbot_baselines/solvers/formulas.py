@@ -69,7 +69,7 @@ def _along(
         return casadi.Function(
             name, [x, towards, u, c, s], [casadi.vertcat(values, slopes, casadi.jtimes(slopes, s, 1))]
         )
-    except Exception as error:  # whatever code of users raises that meets a symbol
+    except Exception as error:  # users' code may raise any error when it gets a symbol
         raise ValueError(f"{task.id}: {name} cannot be differentiated ({error}). {_ADVICE}") from error
 
 
