@@ -1,7 +1,7 @@
-"""What each engine gets wrong: order of convergence, slip against friction, free fall over, spin, and a flight.
+"""The errors of each engine: order of convergence, slip against friction, free fall over, spin, and a flight.
 
-Closed form, PyBullet and MuJoCo, those that are installed, one after another, in seconds. Drake, of the extra `[bench]`, is
-their referee for the rolling robot: point contact, by its solver SAP. Writes engine_errors.csv.
+Measures the closed form, and PyBullet and MuJoCo if installed, one after another, in seconds. Drake, of the extra `[bench]`,
+is the reference for the rolling robot: point contact, by its solver SAP. Writes engine_errors.csv.
 """
 
 import importlib.util

@@ -1,4 +1,4 @@
-"""What the floor must give: friction and normal force along the paper's optima, and what a limit of friction costs."""
+"""The forces of the floor along the paper's optima, friction and normal force, and the cost of a limit of friction."""
 
 import dataclasses
 import math
@@ -185,11 +185,11 @@ def main(
     Args:
         out: folder of the results.
         contact_episodes: of each task's certified ones, in which the rolling robot tracks its plans in PyBullet's contact;
-            contact.csv says what the floor gave.
+            contact.csv has the forces of the floor.
         costs: also find optima of the rolling robot at several coefficients of friction, which takes minutes, and write
             sweep.csv and sweep.png with their cost and greatest lean.
         unknown_episodes: of the rolling robot's certified ones on the track "unknown", whose optima are found for the
-            slipperiest floor too; never_slip.csv says what that costs.
+            slipperiest floor too; never_slip.csv has the additional cost.
     """
     demand(out)
     if costs:

@@ -1,6 +1,6 @@
 """Puts evaluation sets into the package: python benchmarks/install_optima.py SET.npz ..., as `ballbot certify` writes them.
 
-Where an episode's optimum there is cheaper, it stays.
+If the package has a cheaper optimum of an episode, that one is retained.
 """
 
 import sys

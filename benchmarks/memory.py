@@ -1,6 +1,6 @@
 """Peak resident memory of what users do, each in a process of its own: importing, one environment, a batch, an optimum.
 
-It needs Linux, whose kernel says the peak.
+It needs Linux, whose kernel reports the peak.
 """
 
 import subprocess

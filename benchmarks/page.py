@@ -105,7 +105,7 @@ def main(
     Args:
         out: folder of the pages, one folder for each commit.
         sections: names of the scripts to run; default, all.
-        quick: shorter runs, whose figures only show that everything works.
+        quick: shorter runs, which only show that everything works.
         previous: page to compare with; default, the newest of another commit.
     """
     known = [section.script for section in SECTIONS]

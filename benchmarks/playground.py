@@ -1,4 +1,4 @@
-"""The playground in real time: how well it keeps it, and whether its memory grows.
+"""Whether the playground keeps real time, and whether its memory grows.
 
     python benchmarks/playground.py --minutes 10
 

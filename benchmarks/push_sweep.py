@@ -1,7 +1,7 @@
 """The hardest push that the robot recovers from: LQR, trajectory optimization re-planned from the push, and NMPC.
 
-At rest, the body is hit at its centre of mass by a horizontal impulse. LQR and NMPC meet it unprepared: NMPC planned to stand
-still. Re-planning knows the pushed state and takes the time it takes.
+At rest, the body is hit at its centre of mass by a horizontal impulse. LQR and NMPC are not
+prepared for it: NMPC has planned to stand still. Re-planning starts from the state after the push, without a time limit.
 """
 
 from collections.abc import Callable

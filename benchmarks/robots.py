@@ -1,4 +1,4 @@
-"""What a ball that rolls costs in speed: the batch's throughput and NMPC's control step, of each robot in one run.
+"""The computation time of a rolling ball: the batch's throughput and NMPC's control step, of each robot in one run.
 
 Times are of the processor and of one thread, so that a busy machine spoils them less; runs of the robots alternate. Run it
 with OMP_NUM_THREADS=1.

@@ -1,4 +1,4 @@
-"""What each executor costs per item, what more workers bring, and whether everything arrives when a node is killed.
+"""The overhead of each executor per item, the speed-up by more workers, and whether all results arrive if a node is killed.
 
     python benchmarks/scale_out.py                      # needs pip install "ballbot-gym[ray]"
     python benchmarks/scale_out.py --parts kill --episodes 400

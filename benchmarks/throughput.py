@@ -1,7 +1,7 @@
 """Control steps per second: ours, single and batched, against the raw loops of the engines, EnvPool and Gymnasium's MuJoCo.
 
 Random actions, resets included, one measurement after another, each in a process of its own. EnvPool and MuJoCo come with
-the extra `[bench]`; what is not installed is said so in the table.
+the extra `[bench]`; the table says which of them are not installed.
 """
 
 import importlib.util

@@ -1,4 +1,4 @@
-"""The paper's four point-to-point problems, by this package and by what the paper's author used: Drake with SNOPT.
+"""The paper's four point-to-point problems, by this package and by the paper's tools, Drake with SNOPT.
 
 The same URDF, the same problem and the same transcription (Hermite–Simpson, forces linear between knots, one free step,
 cost summed over knots). Both start from a cubic, and Drake also from the paper's straight line. Equal optima are asserted.

@@ -28,7 +28,7 @@ class Row(NamedTuple):
 
     task: str
     controller: str
-    told: dict[str, Any] = {}
+    labels: dict[str, Any] = {}
 
 
 NAMES = (

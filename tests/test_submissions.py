@@ -124,7 +124,7 @@ def test_an_end_that_is_none_is_refused(forge, submitted):
     honest = recordings.read(submitted()[1])
     shorter = {"lengths": honest.lengths - [0, 3], "states": honest.states[:-3], "actions": honest.actions[:-3]}
     with pytest.raises(
-        SubmissionError, match=r"episode 1, step \d+: the recording stops here, and the episode has not"
+        SubmissionError, match=r"episode 1, step \d+: the recording stops here, but the episode has not"
     ):
         forge(**shorter)
     x = named_robot("paper").step(honest.states[-1:], np.zeros((1, 2)), 0.02)

@@ -1,4 +1,4 @@
-"""`ballbot basins`: from where each controller recovers, and from where anything could."""
+"""`ballbot basins`: the states that each controller recovers from, and those that any controller could."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def basins(
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
         workers: who does the work.
-        robot: whose limits and controllers.
+        robot: name of the robot, with its limits and controllers.
         filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
     if not 3 <= points <= 501 or points % 2 == 0:

@@ -45,10 +45,10 @@ def benchmark(
             with the package. A policy is run on the task it was made for.
         episodes: how many of each task's certified episodes.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        seed: of the bootstrap intervals, and of whatever an episode draws.
+        seed: of the bootstrap intervals, and of everything that an episode draws.
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
-        robot: whose episodes and controllers.
+        robot: name of the robot, with its episodes and controllers.
         randomization: names of tracks, "unknown", "late", "noisy" or "real". Their robots, delays and sensors are hidden from
             the controllers. The result is then one table of controllers by tracks, with the parts of their regret. By default
             the experts that are made for each track run.

@@ -33,7 +33,8 @@ def certify(
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
-    Optima are kept in the user's cache folder as they are found, where all evaluation looks for those that the package lacks.
+    Every optimum is stored in the user's cache folder when it is found. Evaluations read the optima that the package lacks
+    from there.
 
     Args:
         tasks: names of tasks.
@@ -42,7 +43,7 @@ def certify(
             memory. See `ballbot_train.work.shards`.
         out: folder of the .npz files.
         workers: who does the work.
-        robot: whose sets.
+        robot: name of the robot.
         randomization: name of the track that each episode's robot and delay are drawn from; default, none.
     """
     check_some("task", tasks, TASKS)

@@ -15,10 +15,10 @@ def compare(
     match: tuple[str, str] | None = None,
     training_margin: float = comparison.TRAINING_MARGIN,
 ) -> None:
-    """Says for every task and controller whether B is better than A, worse, or that the episodes cannot tell.
+    """Prints for every task and controller whether B is better than A, worse, or whether the episodes cannot tell.
 
     Args:
-        a: folder of a benchmark, or its leaderboard.json; or the name of a row of the leaderboard, as lqr.
+        a: folder of a benchmark, or its leaderboard.json; or the name of a row of the leaderboard, such as lqr.
         b: the other.
         match: a controller of A and one of B, to compare controllers of different names.
         training_margin: between policies with different weights, smaller differences of success and regret decide nothing,

@@ -1,4 +1,4 @@
-"""`ballbot new`: a package for a task of one's own."""
+"""`ballbot new`: creates a package for your own task."""
 
 import builtins
 import keyword
@@ -24,7 +24,7 @@ _OURS = ("ballbot_gym", "ballbot_baselines", "ballbot_train")
 
 
 def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: int = 8) -> None:
-    """Makes a package for a task of your own: the task, its test, pyproject.toml, README and a first leaderboard.
+    """Creates a package for your own task: the task, its test, pyproject.toml, README and a first leaderboard.
 
     Args:
         kind: task.

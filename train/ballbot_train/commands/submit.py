@@ -16,8 +16,8 @@ def submit(
     Args:
         results: folder that evaluate(out=...) or `ballbot benchmark` wrote.
         name: of the leaderboard's row.
-        link: where one reads about the controller; an address that begins with https://.
-        controller: which one, where the folder has several.
+        link: address of a page about the controller; it begins with https://.
+        controller: which one, if the folder has several.
         out: folder of the submissions.
     """
     packed = submissions.pack(results, name, link, controller)

@@ -33,7 +33,7 @@ class Run:
     out: Path | None = None
     """Folder; default runs/train/TASK-LEARNER."""
     seed: int = number(0, 0, 2**32 - 1)
-    """Seed of all that is drawn."""
+    """Seed of all random numbers."""
     resume: bool = False
     """Continue the run in this folder."""
     robot: RobotName = PAPER
@@ -45,15 +45,15 @@ class Run:
     randomization: str | None = None
     """Track: unknown, late, noisy or real; not sac."""
     history: int = number(0, 0)
-    """Earlier observations and actions that are seen."""
+    """Number of earlier observations and actions that the policy observes."""
     informed: bool = False
     """The policy gets each robot's parameters, and runs behind a filter that estimates them."""
     threads: int = number(1, 1, 1024)
     """Threads of torch."""
     test_episodes: int = number(certified.EPISODES, 1, certified.EPISODES)
-    """Certified episodes that measure the kept policy."""
+    """Number of certified episodes that measure the chosen policy."""
     validation_episodes: int = number(VALIDATION_EPISODES, 1, 100_000)
-    """Fresh episodes that choose the policy to keep."""
+    """Number of fresh episodes that decide which policy is kept."""
 
     @property
     def warm(self) -> bool:

@@ -1,7 +1,7 @@
 """`ballbot transfer`: controllers made for one robot, run on another, in one physics engine or in several.
 
 A controller plans and observes as for its own robot. Its cost is compared with the optimum of the robot that it runs on, on
-that robot's own floor, on other floors too.
+that robot's own floor, even if it runs on another floor.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def transfer(
         robot: what they run on, with its certified episodes.
         frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
         episodes: how many of each task's certified episodes.
-        physics: "bullet", "mujoco" or "rk4", with contact where the ball rolls except in the last; default, the first that is
+        physics: "bullet", "mujoco" or "rk4", where "rk4" has no contact between ball and floor; default, the first that is
             installed.
         seed: of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.

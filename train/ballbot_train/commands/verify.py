@@ -10,7 +10,7 @@ from ballbot_train.work.console import console, print_rows
 
 
 def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
-    """Verifies submissions to the leaderboard without policy or trust, and prints the row of each.
+    """Verifies submissions to the leaderboard from their motions, without the policy, and prints the row of each.
 
     Args:
         files: of `ballbot submit`.

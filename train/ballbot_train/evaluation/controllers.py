@@ -201,7 +201,7 @@ def portable(name: str, task: Task, params: Robot) -> str | Controller:
 
 
 def make_controller(name: str, task: Task, params: Robot) -> Controller:
-    """The controller that a name stands for. torch is imported only for a policy.
+    """The controller of a name. torch is imported only for a policy.
 
     Args:
         name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file

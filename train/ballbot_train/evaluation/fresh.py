@@ -101,7 +101,7 @@ class FreshResult:
     durations: np.ndarray
     """(n,) s."""
     measures: dict[str, np.ndarray]
-    """What `Task.measures` says of each episode."""
+    """The result of `Task.measures` for each episode."""
     optima: np.ndarray
     """(k,) optimal costs of the first k ≤ n episodes; NaN where none was found."""
     drawn: np.ndarray

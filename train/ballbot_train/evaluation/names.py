@@ -17,7 +17,7 @@ _LONGEST = 60  # characters of a name that a file's name repeats
 
 
 def file_part(name: str) -> str:
-    """A part of a file's name that stands for this name alone, on file systems that ignore the case of letters too.
+    """A part of a file's name that is unique to this name, also on file systems that ignore the case of letters.
 
     A name of small letters, digits and single hyphens is kept. Any other name, such as a path, is shortened and gets a
     digest of all of it. So does a name that ends like a digest, or that holds the name of a robot or an engine: file names

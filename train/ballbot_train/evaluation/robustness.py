@@ -1,8 +1,8 @@
 """The leaderboard under disturbances: how success and regret change with their severity, and with tracks.
 
-No controller knows of the disturbance: experts plan for the nominal robot with ideal actuators and sensors. Every controller
-meets the same draws. Under a stress, regret is measured against the undisturbed optimum, so no controller could avoid all of
-it.
+The disturbance is hidden from all controllers: experts plan for the nominal robot with ideal actuators and sensors. Every
+controller gets the same draws. Under a stress, regret is measured against the undisturbed optimum, so no controller could
+avoid all of it.
 
 The tracks of `ballbot_gym.robot.randomization` are unknown robots. Every episode has an optimum of its own there: that of its
 robot, whose first forces are zero while its delay lasts. Only a controller with access to the drawn parameters could reach

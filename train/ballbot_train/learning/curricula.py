@@ -34,7 +34,7 @@ from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.work.console import console
 
 FAILURE_PRICE = 60.0
-"""What a failure costs at once where living does not pay."""
+"""Cost of a failure where the reward has no bonus for survival; it is due at once."""
 
 _GOAL_FACTOR, _GOAL_STEP = 5.0, 0.97  # how much wider the goal begins, and the factor by which it narrows
 _RAMPS = {"max_speed": (4.05, 0.2)}  # fields that bound what is drawn: where they begin, and the step to the task's own

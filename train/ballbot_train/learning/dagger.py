@@ -5,11 +5,10 @@ possible. Half of the episodes then follow the expert, with noise, and half the 
 optimum is searched again, and the episode runs again from there (Ross et al., "A reduction of imitation learning and
 structured prediction to no-regret online learning", 2011, with the mixture β of expert and learner drawn per episode).
 
-The feedback about an optimum is the derivative of the optimal force with respect to the state. So it labels every state that
-an episode comes to, as long as that lies near its optimum. Errors are weighted by one over the cost of the episode's optimum,
-as regret is.
+The feedback about an optimum is the derivative of the optimal force with respect to the state. It labels every state that an
+episode reaches near its optimum. Errors are divided by the cost of the episode's optimum, as in the regret.
 
-On a track the expert knows each episode's robot, and the learner sees what it sees.
+On a track the expert has access to each episode's robot. The learner gets observations alone.
 """
 
 import contextlib

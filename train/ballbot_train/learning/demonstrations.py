@@ -326,7 +326,7 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
     env = gymnasium.make(task.id, physics=config.physics, robot=config.robot)
     # Minari offers no other way to choose the folder
     with closing(env), patch.dict(os.environ, MINARI_DATASETS_PATH=str(root)), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
+        warnings.filterwarnings("ignore", message=".*is set to None.*")  # the authors, which a run does not have
         dataset = minari.create_dataset_from_buffers(
             dataset_id=out.name,
             buffer=[each for arrays in parts for each in _buffers(arrays)],

@@ -74,7 +74,7 @@ _AVERAGED_ITERATIONS = 10  # over which the policy is a running average of the a
 _CLONE_ITERATIONS, _CLONE_STEPS, _CLONE_BATCH, _CLONE_RATE = 60, 300, 1024, 2e-3  # the rate falls linearly to 0
 _WAITING_PROGRESS = 0.2  # share of their course at which schedules wait until training backwards has come to the task
 _SETTLED_LEARNING_RATE = 7e-4  # when it has come there, from where it falls to the same end
-_WARMUP_ITERATIONS = 15  # of the critic alone, after a warm start: an untrained one would undo what the actor knows
+_WARMUP_ITERATIONS = 15  # of the critic alone, after a warm start: an untrained one would spoil the actor
 
 
 Bootstrap = Callable[[np.ndarray], np.ndarray]

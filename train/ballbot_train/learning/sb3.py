@@ -36,7 +36,7 @@ class BallbotVecEnv(VecEnv):
 
         Raises:
             TypeError: env is something else; `.unwrapped` of what `gymnasium.make_vec` returns is right.
-            ValueError: its autoreset mode is not the one that Stable-Baselines3 knows, SAME_STEP.
+            ValueError: its autoreset mode is not SAME_STEP, the only one that Stable-Baselines3 supports.
         """
         if not isinstance(env, BallbotVectorEnv):
             raise TypeError(f"BallbotVecEnv needs a BallbotVectorEnv, not {type(env).__name__}")

@@ -64,7 +64,7 @@ _HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's sp
 
 
 def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, str]:
-    """What an ONNX file says of its policy: task, layouts and units of input and output, rate, and where it comes from."""
+    """The metadata of an ONNX file: task, layouts and units of input and output, control rate, and origin of the policy."""
     described, params = read_description(policy), named_robot(robot)
     if described["spec"].get("informed"):
         raise PolicyError(

@@ -182,10 +182,10 @@ class PolicyNetwork(torch.nn.Module):
 
 
 class Routes(torch.nn.Module):
-    """From observations to the sides on which obstacles are passed, by a small network that knows only where these lie.
+    """From observations to the sides on which obstacles are passed, by a small network. Its input is the layout of obstacles.
 
     A choice of sides is the best of several basins, and a network that averages basins hits what lies between them. So the
-    choice is made apart, as a classification. The layout stays the same throughout an episode, so the choice does not waver.
+    choice is a separate classification. The layout stays the same throughout an episode, so the choice does not waver.
     Its outputs, before the greatest is taken, belong to the 2^n choices of obstacles that are passed on the farther side.
     """
 

@@ -1,6 +1,6 @@
-"""The simulation of the live playground, which knows nothing of pages: a ballbot, ghosts, pushes, hidden changes, costs.
+"""The simulation of the live playground, independent of its page: a ballbot, ghosts, pushes, hidden changes, costs.
 
-The robot that counts is the main one. Ghosts get the same start and the same pushes under other controllers.
+Ghosts are further robots with other controllers. They get the same start and the same pushes as the main robot.
 """
 
 import contextlib

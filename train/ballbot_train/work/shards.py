@@ -1,6 +1,6 @@
 """Data sets of any size as shards: .npz files of some hundred episodes, in a folder or on object storage.
 
-A set is a folder of this machine, or of storage that fsspec knows: runs/set, s3://BUCKET/set or gs://BUCKET/set, say.
+A set is a folder of this machine, or of storage that fsspec supports: runs/set, s3://BUCKET/set or gs://BUCKET/set, say.
 
 | file | holds |
 |---|---|
