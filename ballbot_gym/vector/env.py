@@ -14,9 +14,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ballbot_gym.array_batch import BallbotArrays
-from ballbot_gym.autoreset import as_array, filled, info_of, masked, step
-from ballbot_gym.batch_state import BatchState, check_starts
 from ballbot_gym.checks import (
     check_constant_names,
     check_finite,
@@ -31,15 +28,18 @@ from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task, robot_of
 from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
-from ballbot_gym.native import BallbotNative
 from ballbot_gym.robot import PAPER, Randomization, Robot, checked_randomization
 from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.arrays import BallbotArrays
+from ballbot_gym.vector.autoreset import as_array, filled, info_of, masked, step
+from ballbot_gym.vector.native import BallbotNative
+from ballbot_gym.vector.state import BatchState, check_starts
 
 if TYPE_CHECKING:
     import torch
 
-    from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.vector.batch import BallbotBatch
 
 _ENGINES = ("auto", "native", "torch", "numpy")
 
@@ -304,7 +304,7 @@ def _in_torch(
     """What computes the envs where torch is installed; arguments as of `BallbotVectorEnv`."""
     import torch
 
-    from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.vector.batch import BallbotBatch
 
     cpu = torch.device(device).type == "cpu"
     if engine in ("native", "numpy") and not cpu:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite
+from ballbot_gym.vector.state import BatchState
 
 if TYPE_CHECKING:
     import torch
 
-    from ballbot_gym.batch import BallbotBatch, BatchStep
+    from ballbot_gym.vector.batch import BallbotBatch, BatchStep
 
 _NOTHING_DONE = ("reward", "cost", "terminated", "truncated", "success", "failure", "force", "clipped", "grip")
 """Fields of a `BatchStep` that are 0 of an env that waits."""

@@ -1,7 +1,7 @@
 """BallbotNative: what `BallbotBatch` does without gradients, in machine code that is compiled once per task and robot.
 
 `codegen` writes the C code, `machine_code` compiles it within a second or two, and it serves batches of all sizes. Episodes
-are those of `BallbotBatch`: the same `counter_rng` numbers for the same seeds. Motions agree to rounding, and are
+are those of `BallbotBatch`: the same `seeding` numbers for the same seeds. Motions agree to rounding, and are
 bit-identical wherever an env stands in whatever batch.
 """
 
@@ -18,14 +18,14 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import machine_code
-from ballbot_gym.autoreset import Info, Step, info_of, told
-from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
-from ballbot_gym.identity import problem_digest
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import problem_digest
+from ballbot_gym.vector.autoreset import Info, Step, info_of, told
+from ballbot_gym.vector.state import BatchState
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
@@ -258,7 +258,7 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
 
     A symbol that is made a float, for one, becomes NaN without a word.
     """
-    from ballbot_gym.array_batch import BallbotArrays  # a subclass of this module's class
+    from ballbot_gym.vector.arrays import BallbotArrays  # a subclass of this module's class
 
     dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
@@ -294,7 +294,7 @@ def _source(task: Task, params: Robot, double: bool) -> str:
     """
     if find_spec("casadi") is None and (written := machine_code.shipped_source(code_name(task, params, double))):
         return written
-    from ballbot_gym import codegen  # it imports CasADi
+    from ballbot_gym.machine_code import codegen  # it imports CasADi
 
     return codegen.source(task, params, double)
 
