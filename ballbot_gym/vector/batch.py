@@ -33,7 +33,7 @@ from ballbot_gym.robot import (
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import check_observation, limit_names, outcome
 from ballbot_gym.tasks import Task
-from ballbot_gym.vector.state import BatchState, check_starts
+from ballbot_gym.vector.state import BatchState, _check_starts
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -144,7 +144,7 @@ class BallbotBatch:
             TypeError: a keyword that is no field of the task.
         """
         check_num_envs(num_envs)
-        dtype = dtype_named(dtype)
+        dtype = _dtype_named(dtype)
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
         if compile not in (True, False, "auto"):
@@ -246,7 +246,7 @@ class BallbotBatch:
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c, drawn)
         if x is not None:
-            check_starts(self.task, new.x, new.c, mask)
+            _check_starts(self.task, new.x, new.c, mask)
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
 
     def _check_tensor(self, given: Any, shape: tuple[int, ...], what: str) -> None:
@@ -500,6 +500,6 @@ def _described(value: Any) -> str:
     return f"one of shape {tuple(value.shape)}, {value.dtype}" if isinstance(value, torch.Tensor) else shown(value)
 
 
-def dtype_named(dtype: Any) -> Any:
+def _dtype_named(dtype: Any) -> Any:
     """A dtype that may be given by its name, as in a spec that was JSON."""
     return {"float32": torch.float32, "float64": torch.float64}.get(dtype, dtype) if isinstance(dtype, str) else dtype

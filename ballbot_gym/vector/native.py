@@ -24,7 +24,7 @@ from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_digest
-from ballbot_gym.vector.autoreset import Info, Step, info_of, told
+from ballbot_gym.vector.autoreset import Info, Step, _as_gymnasium, _info_of
 from ballbot_gym.vector.state import BatchState
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
@@ -170,7 +170,7 @@ class BallbotNative:
             rows = rows[self._told_rows :]
             end = self._info(old._replace(x=rows[: self.params.state_size]), rows, pay[5:], flags[6:], violated)
             last = last.take(ended, 0)
-        return told(observation, pay[0], flags[0], flags[1], now, end, last)
+        return _as_gymnasium(observation, pay[0], flags[0], flags[1], now, end, last)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
         """What a step from a state computes, and whether an action is not finite."""
@@ -208,7 +208,7 @@ class BallbotNative:
         grip = pulls + self.params.action_size
         force, (success, failure, clipped) = rows[pulls:grip], flags[:3]
         did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._told_rows]
-        return info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
+        return _info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and their measurements, a row (B,) each."""
