@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.lazy import exports
-from ballbot_gym.paths import catmull_rom, cubic, then_stay
 from ballbot_gym.registry import load_plugins, register_task
 from ballbot_gym.robot import (
     Ballbot,
@@ -34,14 +33,15 @@ from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import SHIPPED, TASKS, BallbotTask, Reference, Task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.orbit import Orbit
+from ballbot_gym.tasks.paths import catmull_rom, cubic, then_stay
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave
 from ballbot_gym.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from ballbot_gym.batch import BallbotBatch
     from ballbot_gym.vector import BallbotVectorEnv
+    from ballbot_gym.vector.batch import BallbotBatch
 
 __all__ = [
     "TASKS",
@@ -83,7 +83,9 @@ __all__ = [
     "then_stay",
 ]
 
-__getattr__ = exports(__name__, {"BallbotBatch": "batch", "BallbotVectorEnv": "vector"})  # torch is imported for them
+__getattr__ = exports(
+    __name__, {"BallbotBatch": "vector.batch", "BallbotVectorEnv": "vector"}
+)  # torch is imported for them
 
 try:
     __version__ = importlib.metadata.version("ballbot-gym")

@@ -11,7 +11,6 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym import step_code
 from ballbot_gym.checks import (
     check_constant_names,
     check_history,
@@ -25,6 +24,7 @@ from ballbot_gym.drawing.picture import picture
 from ballbot_gym.drawing.viewer import Viewer, can_show, need_library
 from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
+from ballbot_gym.machine_code import step_code
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robot import (
     PAPER,

@@ -20,7 +20,7 @@ Vector = Any
 def _library(a: Any) -> ModuleType:
     """The library of `a`. It is already imported, because `a` exists."""
     module = type(a).__module__
-    return sys.modules.get(module if module == "ballbot_gym.traced" else module.partition(".")[0], np)
+    return sys.modules.get(module if module == "ballbot_gym.machine_code.traced" else module.partition(".")[0], np)
 
 
 def sin(a: Any) -> Any:

@@ -10,13 +10,12 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym.checks import real_array
-from ballbot_gym.display import Moving
 from ballbot_gym.engines import checked_physics, make_simulator
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.marker import Marker
-from ballbot_gym.trajectory import Trajectory
+from ballbot_gym.trajectory import Moving, Trajectory
 
 
 class PlanError(RuntimeError):

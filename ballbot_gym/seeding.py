@@ -1,4 +1,8 @@
-"""Seeds of episodes, so that runs with different seeds have no episode in common."""
+"""Seeds of episodes, so that runs with different seeds have no episode in common, and random numbers of batches.
+
+The random numbers are a hash of (the env's seed, the episode's number, the step, an index), in torch or NumPy. They
+therefore do not depend on the batch or on an env's position in it, and the starts of new episodes are drawn without a loop.
+"""
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -9,6 +13,7 @@ import numpy as np
 from ballbot_gym.checks import shown
 
 _EPISODES = 1_000_000
+_WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then never overflow
 
 
 def spawned(seed: int) -> int:
@@ -47,3 +52,23 @@ def seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None
         if not 0 <= value < 2**63:
             raise ValueError(f"seeds must be in [0, 2^63), not {shown(value)}")
     return [None if value is None else int(value) for value in seeds]
+
+
+def key(seed: Any, episode: Any, step: Any) -> Any:
+    """(B,) words that determine the random numbers of one step. Step 0 is the start of the episode. Ints give an int."""
+    return _mix(_mix(_mix(_mix(seed & _WORD) ^ (seed >> 32)) ^ (episode & _WORD)) ^ (step & _WORD))
+
+
+def uniforms(key: Any, count: int, dtype: Any) -> tuple[Any, ...]:
+    """`count` tensors or arrays (B,) of uniform numbers in [0, 1), multiples of 2⁻²⁴ and so the same in both dtypes."""
+    words = (_mix((key + 0x9E3779B9 * i) & _WORD) for i in range(1, count + 1))
+    if isinstance(key, np.ndarray):
+        return tuple((word >> 8).astype(dtype) * dtype(2.0**-24) for word in words)
+    return tuple((word >> 8).to(dtype) * 2.0**-24 for word in words)
+
+
+def _mix(word: Any) -> Any:
+    """A bijection that scatters 32-bit words. It has the multiply and xor-shift rounds of MurmurHash's finalizer."""
+    word = ((word ^ (word >> 16)) * 0x21F0AAAD) & _WORD
+    word = ((word ^ (word >> 15)) * 0x735A2D97) & _WORD
+    return word ^ (word >> 15)

@@ -181,7 +181,7 @@ def check_observation(observation: Any, params: Robot, randomization: Randomizat
     return observation
 
 
-def observation_size(task: Task, params: Robot, observation: str) -> int:
+def _observation_size(task: Task, params: Robot, observation: str) -> int:
     """Numbers that are observed. Sensors show 9 readings, x and y where the episode began, m, and the task's constants."""
     if observation == "state":
         return task.observation_size(params)
@@ -193,7 +193,7 @@ def observation_space(task: Task, params: Robot, history: int = 0, observation: 
 
     Past actions lie in [−1, 1]. So the bounds tell this space from a stack of frames that has the same size.
     """
-    own = observation_size(task, params, observation)
+    own = _observation_size(task, params, observation)
     past = np.append(np.full(own, _LARGEST_OBSERVED), np.ones(params.action_size))
     high = np.append(np.full(own, _LARGEST_OBSERVED), np.tile(past, history)).astype(np.float32)
     return spaces.Box(-high, high, dtype=np.float32)

@@ -1,14 +1,15 @@
-"""Trajectory: states and forces over time, with interpolation and a file format."""
+"""Trajectory: states and forces over time, with interpolation and a file format; and how motions show themselves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ballbot_gym import files
-from ballbot_gym.display import Moving
-from ballbot_gym.paths import hermite_basis
-from ballbot_gym.robot import Ballbot, tilt
+from ballbot_gym import files, lazy
+from ballbot_gym.robot import Ballbot, Robot, tilt
+from ballbot_gym.tasks.paths import hermite_basis
 
 MAX_SAMPLES = 1_000_000
 """Times that `Trajectory.resampled` gives at most."""
@@ -16,6 +17,50 @@ MAX_SAMPLES = 1_000_000
 
 class TrajectoryError(ValueError):
     """The arrays of a trajectory do not fit together, or a file holds no trajectory."""
+
+
+class Displayed:
+    """What shows itself by its facts."""
+
+    def facts(self) -> dict[str, str]:
+        """What there is to say in a line: figures with their units, by what they are."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name} {value}' for name, value in self.facts().items())})"
+
+
+class Moving(Displayed):
+    """What shows a motion: a trajectory, an episode or an optimum.
+
+    Replays and figures are drawn by `ballbot_train.report`, which is imported when it is asked for.
+    """
+
+    @property
+    def motion(self) -> "Trajectory":
+        """The motion that is shown."""
+        return getattr(self, "trajectory")  # noqa: B009 (a field of the subclasses)
+
+    def show(self, *others: "Moving", labels: Sequence[str] = (), robot: str | Robot = "paper") -> Path | None:
+        """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.
+
+        Args:
+            others: trajectories, episodes or optima to show beside it.
+            labels: a name for each; default, what they are.
+            robot: what is drawn, a name in `ROBOTS` or its parameters.
+
+        Returns:
+            The page that was written and opened; None in a notebook.
+
+        Raises:
+            ModuleNotFoundError: the extra that draws is not installed; the message names it.
+            ValueError: no such robot, another number of labels, or a single state, in which nothing moves.
+        """
+        return lazy.load("ballbot_train.report.notebook:show_motions")((self, *others), labels, robot)
+
+    def plot(self, *others: "Moving", labels: Sequence[str] = ()) -> Any:
+        """A matplotlib Figure of positions, velocities, leans, forces and the path. Arguments and errors: as of `show`."""
+        return lazy.load("ballbot_train.report.notebook:plot_motions")((self, *others), labels)
 
 
 @dataclass(frozen=True, repr=False)

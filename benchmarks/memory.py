@@ -18,9 +18,9 @@ _BATCH = (
 _OPTIMUM = "task = make_task({task!r}); find_optimum(task, default_params(), *episode(task, default_params(), 0))"
 _FROM = {
     "env": "import gymnasium, ballbot_gym",
-    "batch": "import torch; from ballbot_gym.batch import BallbotBatch; from ballbot_gym.tasks.stabilize import Stabilize",
+    "batch": "import torch; from ballbot_gym import BallbotBatch, Stabilize",
     "optimum": "from ballbot_baselines import find_optimum; from ballbot_gym.certified.cache import episode; "
-    "from ballbot_gym.env import make_task; from ballbot_gym.params import default_params",
+    "from ballbot_gym.env import make_task; from ballbot_gym import default_params",
 }
 # the kernel's own peak of this program; getrusage's is that of the process that started it, where that one was larger
 _REPORT = """

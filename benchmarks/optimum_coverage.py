@@ -15,10 +15,10 @@ import tyro
 from ballbot_baselines import Optimum, find_optimum
 from ballbot_baselines.optimum.guesses import ALL_GUESSES
 from ballbot_gym import files
-from ballbot_gym.paths import sides_passed
 from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_train.work import jobs
 
 _DETOURS = 3

@@ -15,11 +15,11 @@ import tyro
 
 from ballbot_baselines import NmpcController
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.vector.batch import BallbotBatch
 
 
 @dataclass(frozen=True)

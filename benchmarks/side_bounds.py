@@ -18,9 +18,9 @@ import tyro
 from ballbot_baselines import find_optimum
 from ballbot_baselines.optimum import sides
 from ballbot_gym import files
-from ballbot_gym.paths import sides_passed
 from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.tasks.weave import MAX_OBSTACLES, Weave, split_constants
 
 TASK, PARAMS = Weave(), default_params()

@@ -16,11 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
-from ballbot_gym import BallbotEnv, BallbotVectorEnv, codegen, machine_code, native, rollout
+from ballbot_gym import BallbotEnv, BallbotVectorEnv, machine_code, rollout
 from ballbot_gym.env import make_task
+from ballbot_gym.machine_code import codegen
 from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.vector import native
 
 EXPERTS = ("nmpc", "trajopt")
 """The experts that compile something; LQR compiles nothing."""

@@ -12,6 +12,6 @@ class CompiledCode(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         folder, tag = os.environ.get("BALLBOT_COMPILED"), os.environ.get("BALLBOT_TAG")
         if folder and version != "editable":
-            build_data["force_include"][folder] = "ballbot_gym/compiled"
+            build_data["force_include"][folder] = "ballbot_gym/machine_code/compiled"
         if tag and version != "editable":
             build_data["tag"], build_data["pure_python"] = tag, False

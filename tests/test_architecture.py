@@ -101,17 +101,7 @@ def test_only_the_engines_know_physics_engines_and_only_the_viewer_the_library_o
 
 def test_environments_import_no_solver_and_no_learner_at_their_top():
     heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "mujoco", "scipy", "matplotlib", "websockets"}
-    # these are written in torch and CasADi, and imported when first used
-    batched = {
-        "autoreset.py",
-        "batch.py",
-        "batch_episodes.py",
-        "codegen.py",
-        "counter_rng.py",
-        "native.py",
-        "vector.py",
-    }
-    gym = [path for path in FILES if package(path) == "ballbot_gym" and path.name not in batched]
+    gym = [path for path in FILES if package(path) == "ballbot_gym"]
     assert relative(path for path in gym if imports(path, only_top_level=True) & heavy) == []
 
 
@@ -167,7 +157,7 @@ def test_no_file_names_a_place_on_the_developers_machine():
 
 def test_the_cubic_hermite_basis_and_the_angle_of_tilt_each_have_one_place():
     basis = re.compile(r"3 - 2 \* \w+|1 \+ 2 \* \w+\) \*")
-    assert relative(path for path in FILES if basis.search(path.read_text())) == ["ballbot_gym/paths.py"]
+    assert relative(path for path in FILES if basis.search(path.read_text())) == ["ballbot_gym/tasks/paths.py"]
     angle = re.compile(r"\b(math|np|torch)\.(acos|arccos)\(")
     assert relative(path for path in FILES if angle.search(path.read_text())) == ["ballbot_gym/ops.py"]
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ballbot_gym import machine_code
-from ballbot_gym.array_batch import BallbotArrays
 from ballbot_gym.robot import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector.arrays import BallbotArrays
 
 MODES = ("SameStep", "NextStep")
 

@@ -22,12 +22,12 @@ from builders import result
 
 from ballbot_baselines import Backoff
 from ballbot_gym import BallbotEnv, certified, files
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import URDF_PATH, Randomization, default_params, read_urdf
 from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train import evaluate, load_policy
 from ballbot_train.cli import _run
 from ballbot_train.evaluation.controllers import controllers_of

@@ -6,11 +6,12 @@ import torch
 from test_examples import load
 
 from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optima, find_optimum, regret
-from ballbot_gym import BallbotEnv, step_code
-from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.native import BallbotNative
+from ballbot_gym import BallbotEnv
+from ballbot_gym.machine_code import step_code
 from ballbot_gym.rollout import rollout
 from ballbot_gym.step import outcome
+from ballbot_gym.vector.batch import BallbotBatch
+from ballbot_gym.vector.native import BallbotNative
 from ballbot_train.learning.apg import ApgConfig
 from ballbot_train.learning.learners import LEARNERS
 

@@ -12,9 +12,9 @@ import casadi
 import numpy as np
 
 from ballbot_baselines.solvers import compiled
-from ballbot_gym import machine_code
+from ballbot_gym.machine_code import libraries
 
-needs_compiler = pytest.mark.skipif(machine_code.compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(libraries.compiler() is None, reason="no C compiler")
 posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
 
 
@@ -82,7 +82,7 @@ def test_functions_are_compiled_once_and_then_read_from_the_cache(folder, monkey
 def test_library_depends_on_processor_and_content(folder, monkeypatch):
     compiled.compiled("powers", powers())
     compiled.compiled("powers", powers(2.0))
-    monkeypatch.setattr(machine_code, "_machine", lambda compiler: "another processor")
+    monkeypatch.setattr(libraries, "_machine", lambda compiler: "another processor")
     compiled.compiled("powers", powers())
     assert len(list(folder.iterdir())) == 3
 
@@ -90,11 +90,11 @@ def test_library_depends_on_processor_and_content(folder, monkeypatch):
 @needs_compiler
 @pytest.mark.parametrize("damage", ["cut", "changed", "emptied"])
 def test_damaged_library_is_built_anew(folder, damage):
-    library = machine_code.library("two", "int two() { return 2; }")
+    library = libraries.library("two", "int two() { return 2; }")
     content = library.read_bytes()
     broken = {"cut": content[: len(content) // 2], "changed": b"x" + content[1:], "emptied": b""}[damage]
     library.write_bytes(broken)
-    assert machine_code.library("two", "int two() { return 2; }") == library
+    assert libraries.library("two", "int two() { return 2; }") == library
     assert library.read_bytes() != broken
     assert ctypes.CDLL(str(library)).two() == 2
 
@@ -138,14 +138,14 @@ def fake_compiler(folder, tmp_path, monkeypatch):
         program.write_bytes(content)
         program.chmod(0o755)
         monkeypatch.setenv("CC", str(program))
-        machine_code.compiler.cache_clear()
+        libraries.compiler.cache_clear()
         return str(program)
 
     yield make
     monkeypatch.undo()
-    machine_code.compiler.cache_clear()
-    machine_code._machine.cache_clear()
-    machine_code._hanging.clear()
+    libraries.compiler.cache_clear()
+    libraries._machine.cache_clear()
+    libraries._hanging.clear()
 
 
 @posix
@@ -169,14 +169,14 @@ def test_compiler_that_is_none_leaves_functions_interpreted(fake_compiler, caplo
 @posix
 @pytest.mark.parametrize("hangs", ["at --version", "when it compiles"])
 def test_compiler_that_hangs_is_given_up_and_not_asked_again(fake_compiler, monkeypatch, caplog, hangs):
-    monkeypatch.setattr(machine_code, "_VERSION_SECONDS", 0.2 if hangs == "at --version" else 10.0)
-    monkeypatch.setattr(machine_code, "_COMPILE_SECONDS", 0.2)
+    monkeypatch.setattr(libraries, "_VERSION_SECONDS", 0.2 if hangs == "at --version" else 10.0)
+    monkeypatch.setattr(libraries, "_COMPILE_SECONDS", 0.2)
     answer = b"" if hangs == "at --version" else b'[ "$1" = --version ] && exit 0\n'
     program = fake_compiler(b"#!/bin/sh\n" + answer + b"exec sleep 30\n")
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
     assert f"{program} did not answer within 0.2 s" in caplog.text
-    monkeypatch.setattr(machine_code, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
+    monkeypatch.setattr(libraries, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
     assert compiled.compiled("others", functions) is functions
     assert len(caplog.records) == 1
 
@@ -229,10 +229,10 @@ def test_cache_that_is_no_absolute_path_is_refused(monkeypatch, given):
 def test_cache_lies_in_the_users_cache_folder_unless_told_otherwise_by_a_whole_path(monkeypatch, tmp_path):
     monkeypatch.delenv("BALLBOT_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert machine_code.cache_folder() == tmp_path / "ballbot-gym"
+    assert libraries.cache_folder() == tmp_path / "ballbot-gym"
     monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "other"))
-    assert machine_code.cache_folder() == tmp_path / "other"
+    assert libraries.cache_folder() == tmp_path / "other"
     monkeypatch.delenv("BALLBOT_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    assert machine_code.cache_folder() == tmp_path / ".cache" / "ballbot-gym"
+    assert libraries.cache_folder() == tmp_path / ".cache" / "ballbot-gym"

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from ballbot_gym import TASKS, Stabilize, named_robot, ops
-from ballbot_gym.identity import PARTS, changed_parts, named_problem, problem_parts
+from ballbot_gym import TASKS, Stabilize, certified, named_robot, ops
 from ballbot_gym.robot import (
     ROBOTS,
     ROLLING_URDF_PATH,
@@ -19,6 +18,7 @@ from ballbot_gym.robot import (
     registered_name,
     robot_name,
 )
+from ballbot_gym.tasks.identity import PARTS, changed_parts, problem_parts
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.demos import demos
 from ballbot_train.evaluation.runner import open_run
@@ -181,17 +181,17 @@ def test_a_run_is_not_continued_with_another_policy_in_the_same_file(part: str, 
 EARLIER: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], str]] = {
     "a run without a digest": (
         {},
-        {"problem": named_problem("turn", "paper")},
+        {"problem": certified.named_problem("turn", "paper")},
         "an unknown problem, because an earlier",
     ),
     "one with one digest": (
         {"problem": "12ab"},
-        {"problem": named_problem("turn", "paper")},
+        {"problem": certified.named_problem("turn", "paper")},
         "an unknown problem, because",
     ),
     "a benchmark": (
         {},
-        {"problems": {"turn": named_problem("turn", "paper")}},
+        {"problems": {"turn": certified.named_problem("turn", "paper")}},
         "unknown problems, because an earlier version",
     ),
     "a start": ({}, {"start_policy": "12ab"}, "an unknown policy to start from, because an earlier version made it"),

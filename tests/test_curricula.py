@@ -7,9 +7,9 @@ import pytest
 import torch
 from resuming import goes_on_as_if_never_stopped
 
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import default_params
+from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train.learning import curricula
 from ballbot_train.learning.curricula import CurriculumBatch, widened
 from ballbot_train.learning.learners import LEARNERS

@@ -17,7 +17,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv, Randomization
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.robot import default_params, named_robot
 from ballbot_gym.rollout import simulate
@@ -25,6 +24,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector.batch import BallbotBatch
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 UPRIGHT = np.zeros(8)

@@ -82,7 +82,7 @@ for package in ("ballbot_gym", "ballbot_baselines", "ballbot_train"):
 """
     lines = run(code, *EXTRAS).splitlines()
     assert [line for line in lines if not line.startswith(("light ", "named "))] == []
-    for name in ("ballbot_baselines.solvers.ocp", "ballbot_gym.batch", "ballbot_train.learning.ppo"):
+    for name in ("ballbot_baselines.solvers.ocp", "ballbot_gym.vector.batch", "ballbot_train.learning.ppo"):
         assert any(line.startswith(f"named {name} ") for line in lines)
     for name in ("ballbot_gym.env", "ballbot_train"):
         assert f"light {name}" in lines

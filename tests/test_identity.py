@@ -10,8 +10,8 @@ import pytest
 
 from ballbot_gym import TASKS, Stabilize, Turn, named_robot
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import observation_digest, problem_digest
 from ballbot_gym.robot import ROBOTS, Registered
+from ballbot_gym.tasks.identity import observation_digest, problem_digest
 from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.runner import open_run

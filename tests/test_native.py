@@ -14,12 +14,13 @@ torch = pytest.importorskip("torch")
 
 import casadi  # noqa: E402
 
-from ballbot_gym import Randomization, codegen, machine_code, native  # noqa: E402
-from ballbot_gym.batch import BallbotBatch  # noqa: E402
+from ballbot_gym import Randomization, machine_code  # noqa: E402
 from ballbot_gym.env import make_task  # noqa: E402
+from ballbot_gym.machine_code import codegen  # noqa: E402
 from ballbot_gym.tasks import TASKS  # noqa: E402
 from ballbot_gym.tasks.stabilize import Stabilize  # noqa: E402
-from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
+from ballbot_gym.vector import BallbotVectorEnv, native  # noqa: E402
+from ballbot_gym.vector.batch import BallbotBatch  # noqa: E402
 
 needs_compiler = pytest.mark.skipif(machine_code.compiler() is None, reason="no C compiler")
 
@@ -134,7 +135,7 @@ def test_a_forked_process_has_threads_of_its_own():
     """In a process of its own, because this one may have threads that hold locks."""
     code = """
 import numpy as np, os
-from ballbot_gym import native
+from ballbot_gym.vector import native
 from ballbot_gym.vector import BallbotVectorEnv
 native._PARALLEL_FROM = 64
 env = BallbotVectorEnv(100, engine="native")

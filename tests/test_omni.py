@@ -10,12 +10,12 @@ import pytest
 
 from ballbot_baselines import TrajoptController
 from ballbot_baselines.solvers.riccati import discrete_lqr
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import Randomization, Wheels, named_robot, omni
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
+from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train import evaluate
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import SubmissionError, verify

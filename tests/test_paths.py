@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from ballbot_gym.paths import catmull_rom, cubic, then_stay
+from ballbot_gym.tasks.paths import catmull_rom, cubic, then_stay
 
 
 def test_cubic_has_the_positions_and_velocities_asked_for_at_its_ends(rng):

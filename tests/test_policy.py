@@ -8,12 +8,12 @@ import pytest
 import torch
 from builders import random_policy as network_of
 
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import ROBOTS, default_params, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train.evaluation.controllers import make_controller, names
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.policy.files import BEST, PolicyError, PolicySpec, read_description, shipped_policies

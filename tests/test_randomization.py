@@ -9,9 +9,9 @@ pytest.importorskip("torch")
 import torch
 
 from ballbot_gym import Randomization
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.robot import TRACKS, normals
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector.batch import BallbotBatch
 
 ROBOTS = Randomization(body_mass=(0.8, 1.3), ball_mass=(0.5, 2.0), com_height=(0.9, 1.1), inertia=(0.7, 1.4))
 EVERYTHING = replace(

@@ -15,7 +15,7 @@ from ballbot_gym.tasks.stabilize import Stabilize
 
 torch = pytest.importorskip("torch")
 
-from ballbot_gym.batch import BallbotBatch  # noqa: E402
+from ballbot_gym.vector.batch import BallbotBatch  # noqa: E402
 
 ENVS = 32
 """Of each policy."""

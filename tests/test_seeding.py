@@ -8,11 +8,11 @@ import torch
 from stable_baselines3 import PPO
 
 from ballbot_gym import seeding
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train import BallbotVecEnv
 from ballbot_train.evaluation import fresh, runner
 from ballbot_train.learning import dagger, demonstrations

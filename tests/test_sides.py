@@ -9,7 +9,7 @@ from ballbot_baselines import find_optimum
 from ballbot_baselines.optimum import sides
 from ballbot_baselines.optimum.guesses import ALL_GUESSES
 from ballbot_gym import certified
-from ballbot_gym.paths import sides_passed
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.tasks.weave import Weave, split_constants
 
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballbot_gym import TASKS, BallbotEnv, Randomization, machine_code, ops, step_code, traced
+from ballbot_gym import TASKS, BallbotEnv, Randomization, machine_code, ops
 from ballbot_gym.engines.closed_form import Rk4Simulator
+from ballbot_gym.machine_code import libraries, step_code, traced
 from ballbot_gym.robot import tilt
 from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Stabilize
@@ -74,7 +75,7 @@ def test_machine_code_gives_the_bits_of_python(task, physics, robot, randomizati
         pytest.importorskip("pybullet")
     env: Any = BallbotEnv(task, physics, robot=robot, randomization=randomization)
     with monkeypatch.context() as patch:
-        patch.setattr(machine_code, "compiler", lambda: None)
+        patch.setattr(libraries, "compiler", lambda: None)
         python = bits(play(env))
         assert env._judge is None
     step_code._codes.clear()

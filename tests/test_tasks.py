@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from ballbot_gym.paths import sides_passed
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.orbit import Orbit, orbit_tilt, steady_orbit
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave, split_constants

@@ -15,12 +15,12 @@ from ballbot_baselines.feedback.adaptive import AdaptiveNmpcController
 from ballbot_baselines.feedback.kalman import TrackFilter
 from ballbot_baselines.feedback.trajopt import cautious_trajopt
 from ballbot_gym import certified
-from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import ROBOT_FACTORS, TRACKS, Randomization, default_params
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.vector.batch import BallbotBatch
+from ballbot_gym.vector.episodes import run_episodes
 from ballbot_train import evaluate, load_policy
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.controllers import controllers_of, make_controller

@@ -17,9 +17,9 @@ from resuming import goes_on_as_if_never_stopped, parameters
 
 from ballbot_baselines import Backoff
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import problem_parts
 from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.identity import problem_parts
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.train import Run, command_with, parse
 from ballbot_train.learning import apg, training

@@ -11,13 +11,13 @@ pytest.importorskip("torch")
 
 import torch
 
-from ballbot_gym import batch as batch_module
-from ballbot_gym import counter_rng
-from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.batch_episodes import run_episodes
+from ballbot_gym import seeding
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector import batch as batch_module
+from ballbot_gym.vector.batch import BallbotBatch
+from ballbot_gym.vector.episodes import run_episodes
 
 INFO = (
     *("state", "cost", "reward_survive", "reward_cost", "reward_goal", "tilt", "success", "is_success", "failure"),
@@ -227,8 +227,8 @@ def test_seed_repeats_everything_and_without_one_the_next_episodes_come():
 def test_hashed_numbers_are_uniform_and_uncorrelated():
     n = 20_000
     seed = torch.arange(n)
-    z = torch.stack(counter_rng.uniforms(counter_rng.key(seed, 0 * seed, 0 * seed), 8, torch.float64))
-    later = torch.stack(counter_rng.uniforms(counter_rng.key(seed, 0 * seed + 1, 0 * seed), 8, torch.float64))
+    z = torch.stack(seeding.uniforms(seeding.key(seed, 0 * seed, 0 * seed), 8, torch.float64))
+    later = torch.stack(seeding.uniforms(seeding.key(seed, 0 * seed + 1, 0 * seed), 8, torch.float64))
     assert z.min() >= 0
     assert z.max() < 1
     counts = torch.stack([torch.histc(row, 100, 0, 1) for row in z])
@@ -236,7 +236,7 @@ def test_hashed_numbers_are_uniform_and_uncorrelated():
     assert ((chi2 > 99 - 5 * 14.1) & (chi2 < 99 + 5 * 14.1)).all()  # 99 ± five standard deviations
     both = torch.corrcoef(torch.cat([z, later, z[:, torch.roll(seed, 1)]]))
     assert (both - torch.eye(24)).abs().max() < 5 / math.sqrt(n)
-    assert len(counter_rng._mix(torch.arange(2**16)).unique()) == 2**16
+    assert len(seeding._mix(torch.arange(2**16)).unique()) == 2**16
 
 
 def rollout_cost(batch, x0, gain, forces):
@@ -346,7 +346,7 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
         batch.reset(seed=0)
         batch.step(torch.zeros(4, 2))
         batch.step(torch.zeros(4, 2))
-    assert [record.name for record in caplog.records] == ["ballbot_gym.batch"]
+    assert [record.name for record in caplog.records] == ["ballbot_gym.vector.batch"]
     assert "no such compiler" in caplog.text
     assert not batch.compiled
     must = BallbotBatch("stabilize", 4, compile=True)

@@ -32,6 +32,7 @@ from ballbot_gym.robot import (
     track_of,
 )
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import problem_parts
 from ballbot_gym.trajectory import Trajectory
 
 EPISODES = 200
@@ -107,6 +108,11 @@ class EvaluationSet:
 
 
 _PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "statuses", "drawn", "ideal")
+
+
+def named_problem(task: str, robot: str) -> dict[str, str]:
+    """`problem_parts` of a task and a robot by name."""
+    return problem_parts(make_task(task, robot), named_robot(robot))
 
 
 def path_of(task: Task, robot: str = PAPER, track: str = "") -> Path:

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import machine_code, traced
+from ballbot_gym import machine_code
+from ballbot_gym.machine_code import traced
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
 

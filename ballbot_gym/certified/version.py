@@ -18,10 +18,10 @@ def check(found: object, what: object, remedy: str) -> None:
 
 def digest() -> str:
     """Digest of the four shipped tasks with the paper's robot: episodes, costs, limits, observations and optima."""
-    from ballbot_gym import certified, identity
+    from ballbot_gym import certified
     from ballbot_gym.env import make_task
     from ballbot_gym.robot import PAPER, named_robot
-    from ballbot_gym.tasks import SHIPPED
+    from ballbot_gym.tasks import SHIPPED, identity
 
     robot, parts = named_robot(PAPER), []
     for kind in SHIPPED:

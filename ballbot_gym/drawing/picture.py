@@ -130,7 +130,7 @@ class _Painter:
         places, depth = self._pixels(np.column_stack([x, y, np.full(len(stops), _LINE_HEIGHT)]))
         for i in range(0, len(stops) - 1, 2 if path.dashed else 1):
             if (depth[i : i + 2] > _NEAR).all():
-                self._pen.line(places[i : i + 2].ravel().tolist(), rgb(path.color), round(_LINE * self._image.height))
+                self._pen.line(places[i : i + 2].ravel().tolist(), _rgb(path.color), round(_LINE * self._image.height))
 
     def _paint_shadows(self, bodies: Sequence[tuple[list[_Solid], float]]) -> None:
         """Paints the shadows of solids and their opacities on the floor; where two meet, the darker one."""
@@ -150,7 +150,7 @@ class _Painter:
         normals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         light = np.clip(normals @ _LIGHT, 0, 1)[:, None]
-        colors = np.concatenate([np.tile(rgb(color), (len(faces), 1)) for faces, color in solids])
+        colors = np.concatenate([np.tile(_rgb(color), (len(faces), 1)) for faces, color in solids])
         colors = np.minimum(colors * (0.8 + 0.3 * light) + 70 * light**8, 255)
         places, depth = self._pixels(faces)
         shown = (((self._eye - faces.mean(axis=1)) * normals).sum(axis=1) > 0) & (depth > _NEAR).all(axis=1)
@@ -194,7 +194,7 @@ def _arrows(params: Any, robot: Drawn) -> list[_Solid]:
     return solids
 
 
-def rgb(color: str | Sequence[float]) -> Rgb:
+def _rgb(color: str | Sequence[float]) -> Rgb:
     """Red, green and blue, 0 to 255, of a colour "#rrggbb", or of one of shares."""
     if isinstance(color, str):
         return ImageColor.getrgb(color)[:3]

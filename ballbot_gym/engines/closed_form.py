@@ -1,7 +1,7 @@
 """The closed form as a simulator. It needs NumPy alone."""
 
-from ballbot_gym import step_code
 from ballbot_gym.engines.simulator import Simulator, State, check_kind, whole_substeps
+from ballbot_gym.machine_code import step_code
 from ballbot_gym.robot import Robot, substeps_for
 
 

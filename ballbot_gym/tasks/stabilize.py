@@ -8,11 +8,11 @@ import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.paths import cubic, then_stay
 from ballbot_gym.robot import Ballbot, cos_tilt, tilt
 from ballbot_gym.tasks.ballbot import BallbotTask
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.paths import cubic, then_stay
 from ballbot_gym.tasks.symmetry import HALF_TURN, MIRROR_X, MIRROR_Y
 
 _GUESS_SECONDS = 2.5  # how long a guessed path takes to come to rest

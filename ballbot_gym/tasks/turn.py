@@ -8,11 +8,11 @@ import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.paths import cubic
 from ballbot_gym.robot import Ballbot, cos_tilt
 from ballbot_gym.tasks.ballbot import BallbotTask
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.paths import cubic
 
 _START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
 _LINEAR_SECONDS_PER_SPEED = 0.6  # s per m/s: with less LQR falls, with more it is slow (0.5 to 1.0 tried)

@@ -8,11 +8,11 @@ import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.paths import catmull_rom, then_stay
 from ballbot_gym.robot import Ballbot
 from ballbot_gym.tasks.ballbot import BallbotTask
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.paths import catmull_rom, then_stay
 from ballbot_gym.tasks.stabilize import at_rest
 from ballbot_gym.tasks.symmetry import MIRROR_Y
 

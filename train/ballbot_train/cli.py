@@ -147,7 +147,7 @@ class _Lines(logging.Handler):
 
 def _announce_compilation() -> None:
     """Says what is compiled: the first call of a task takes long, and no bar moves meanwhile."""
-    log = logging.getLogger("ballbot_gym.machine_code")
+    log = logging.getLogger("ballbot_gym.machine_code.libraries")
     if not any(isinstance(handler, _Lines) for handler in log.handlers):
         log.addHandler(_Lines(logging.INFO))
         log.setLevel(logging.INFO)

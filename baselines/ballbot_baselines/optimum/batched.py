@@ -30,9 +30,9 @@ from ballbot_baselines.solvers import guess, righting
 from ballbot_baselines.solvers.ilqr import MARGIN, Motions, Options, ilqr
 from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
 from ballbot_gym import machine_code
-from ballbot_gym.paths import sides_passed
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.trajectory import Trajectory
 
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.paths import cubic, then_stay
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.paths import cubic, then_stay
 
 CONSIDERED = 5
 """Guessed paths that are tried at most; tasks name the likeliest first."""

@@ -8,9 +8,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ballbot_baselines.solvers.ocp import Solution
-from ballbot_gym.display import Moving
 from ballbot_gym.tasks.marker import Marker
-from ballbot_gym.trajectory import Trajectory
+from ballbot_gym.trajectory import Moving, Trajectory
 
 
 def _no_feedback() -> np.ndarray:

@@ -23,7 +23,7 @@ from ballbot_baselines.optimum.guesses import (
 from ballbot_baselines.solvers import guess, righting
 from ballbot_baselines.solvers.ocp import Solution
 from ballbot_baselines.solvers.shooting import BARRIER, FREE_TIME_INTERVALS, NEAR_BARRIER, Shooting
-from ballbot_gym.paths import sides_passed
+from ballbot_gym.tasks.paths import sides_passed
 
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
 _HIGH_BARRIER = 1.0  # from one start in thousands fatrop goes in circles with the usual one, and not with this

@@ -21,10 +21,10 @@ from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared
-from ballbot_gym.paths import cubic
 from ballbot_gym.robot import Ballbot
 from ballbot_gym.rollout import Episode, rollout, simulate
 from ballbot_gym.tasks.orbit import steady_orbit
+from ballbot_gym.tasks.paths import cubic
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
 

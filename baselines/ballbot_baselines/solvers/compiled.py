@@ -9,7 +9,8 @@ import logging
 import casadi
 import numpy as np
 
-from ballbot_gym import codegen, machine_code
+from ballbot_gym import machine_code
+from ballbot_gym.machine_code import codegen
 
 LANES = 8
 """Stages that `in_lanes` computes at once: as many float64 as an AVX-512 register holds."""

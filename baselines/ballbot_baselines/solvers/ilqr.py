@@ -26,7 +26,8 @@ from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.compiled import LANES, SIMD
 from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium
 from ballbot_baselines.solvers.shooting import kind_of, ocp_of, symbolic
-from ballbot_gym import codegen, machine_code, ops
+from ballbot_gym import machine_code, ops
+from ballbot_gym.machine_code import codegen
 from ballbot_gym.robot import Kind, Robot, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task

@@ -8,7 +8,6 @@ import numpy as np
 from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import named_problem
 from ballbot_gym.robot import PAPER, checked_randomization, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
@@ -81,7 +80,7 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
         about = {
             "certified": make_task(name, robot).problem(),
             "version": provenance()["version"],
-            "problem": named_problem(name, robot),
+            "problem": certified.named_problem(name, robot),
             **robot_setting(robot),
         }
         set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, robot)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, overload
 
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.identity import problem_parts
 from ballbot_gym.registry import name_of
 from ballbot_gym.robot import PAPER, Randomization, Robot, robot_name
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import problem_parts
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import as_controller, behind, is_file, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard

@@ -20,8 +20,6 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ballbot_gym import files
-from ballbot_gym.batch import BallbotBatch, BatchState
-from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
@@ -29,6 +27,8 @@ from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.batch import BallbotBatch, BatchState
+from ballbot_gym.vector.episodes import run_episodes
 from ballbot_train.evaluation.controllers import Predictor, is_expert, make_controller
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from ballbot_gym.engines import PHYSICS
-from ballbot_gym.identity import digest
 from ballbot_gym.robot import ROBOTS
+from ballbot_gym.tasks.identity import digest
 
 _PLAIN = re.compile("[a-z0-9]+(-[a-z0-9]+)*")
 _DIGEST = 12  # hexadecimal digits

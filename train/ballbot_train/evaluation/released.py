@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ballbot_gym import certified, files
-from ballbot_gym.identity import digest
+from ballbot_gym.tasks.identity import digest
 from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries, summary, too_good, verify
 
 LIST = "released.txt"

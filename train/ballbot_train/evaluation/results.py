@@ -11,7 +11,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.certified import version
-from ballbot_gym.display import Displayed, percent
+from ballbot_gym.trajectory import Displayed
 from ballbot_train.evaluation.names import shortened, with_way
 from ballbot_train.evaluation.statistics import interval
 
@@ -81,7 +81,7 @@ class Row(Displayed):
             "episodes": f"{self.episodes}",
             "success": f"{100 * self.success:.4g} %",
             "failures": f"{self.falls}",
-            "mean regret": percent(self.regret_mean),
+            "mean regret": _percent(self.regret_mean),
         }
 
 
@@ -234,7 +234,7 @@ TABLE: dict[str, Callable[[Row], str]] = {
     "success": lambda row: f"{100 * row.success:.1f} %",
     "falls": lambda row: f"{row.falls}/{row.episodes}",
     "regret mean": lambda row: with_interval(row.regret_mean, row.regret_low, row.regret_high),
-    "regret median": lambda row: percent(row.regret_median),
+    "regret median": lambda row: _percent(row.regret_median),
     "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),
     "settle": lambda row: shown(row.settle_time_median, ".2f", " s"),
     "mean force": lambda row: shown(row.effort_mean, ".0f", " N"),
@@ -267,3 +267,8 @@ def table_cells(
                 key = f"{labels['made_for']}/{key}"
             line[place] = with_way(short[line[place]], ways.get(key, ""))
     return table
+
+
+def _percent(share: float) -> str:
+    """A share in words, "–" where there is none."""
+    return f"{100 * share:.2f} %" if math.isfinite(share) else "–"

@@ -20,7 +20,6 @@ import numpy as np
 from ballbot_gym import certified, files, seeding
 from ballbot_gym.certified import version
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.identity import named_problem
 from ballbot_gym.robot import PAPER, Randomization, Robot, named_robot, robot_setting
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
@@ -72,7 +71,7 @@ def open_run(
         for digest in (registry.policy_digest, registry.network_digest)
     )
     problems = {
-        task if name == robot else f"{name}/{task}": named_problem(task, name)
+        task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
         for made_for, by_task in chosen.items()
         for task in by_task
         for name in (robot, made_for)

@@ -18,10 +18,10 @@ from typing import Any, cast
 
 import torch
 
-from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, actor_for, average_of
 from ballbot_train.learning.routing import fit_routes

@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_gym.batch import BallbotBatch, BatchStep
 from ballbot_gym.ops import Vector
 from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.batch import BallbotBatch, BatchStep
 from ballbot_train.evaluation import fresh
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.work.console import console

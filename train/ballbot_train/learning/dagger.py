@@ -23,12 +23,12 @@ import torch
 
 from ballbot_baselines import Backoff, Optimum, find_optima, find_optimum
 from ballbot_baselines.feedback.trajopt import EXECUTED
-from ballbot_gym.batch import BallbotBatch, BatchState
-from ballbot_gym.batch_episodes import run_episodes
-from ballbot_gym.paths import sides_passed
 from ballbot_gym.robot import Randomization, Robot, registered_name, substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.paths import sides_passed
+from ballbot_gym.vector.batch import BallbotBatch, BatchState
+from ballbot_gym.vector.episodes import run_episodes
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, actor_for
 from ballbot_train.learning.datasets import load_demos

@@ -12,9 +12,9 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.checks import LARGEST
-from ballbot_gym.identity import problem_parts
 from ballbot_gym.robot import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import problem_parts
 from ballbot_train.policy.files import OBSERVATION_VERSION
 from ballbot_train.work import shards
 from ballbot_train.work.console import option

@@ -42,10 +42,10 @@ from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import certified, files, seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.identity import digest, named_problem
 from ballbot_gym.robot import PAPER, Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import digest
 from ballbot_train.evaluation import controllers
 from ballbot_train.learning.datasets import IN_DATASET, metadata_of
 from ballbot_train.policy.files import OBSERVATION_VERSION
@@ -201,7 +201,10 @@ def record(
 
 def _content(config: DemoConfig) -> dict[str, Any]:
     """What decides a dataset behind the names that its settings give."""
-    task, content = make_task(config.task, config.robot), {"problem": named_problem(config.task, config.robot)}
+    task, content = (
+        make_task(config.task, config.robot),
+        {"problem": certified.named_problem(config.task, config.robot)},
+    )
     if controllers.is_expert(config.expert):
         return content
     weights, network = (

@@ -13,11 +13,11 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, RolloutBuffer
 from stable_baselines3.common.logger import Logger
 from torch import nn
 
-from ballbot_gym.batch import BatchState
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_gym.vector.batch import BatchState
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of
 from ballbot_train.learning.critics import value_of_living, weigh_gradients

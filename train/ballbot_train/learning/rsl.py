@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.seeding import spawned
+from ballbot_gym.vector.batch import BallbotBatch
 
 if TYPE_CHECKING:
     from tensordict import TensorDict

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import torch
 
-from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym.vector.batch import BallbotBatch, BatchState
 
 
 def state_of(owner: object, names: Sequence[str]) -> dict[str, Any]:

@@ -47,12 +47,12 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.identity import digest, problem_parts
 from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import digest, problem_parts
+from ballbot_gym.vector.batch import BallbotBatch
+from ballbot_gym.vector.episodes import run_episodes
 from ballbot_train.evaluation import evaluate, fresh, runner
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.learning import VALIDATION_EPISODES

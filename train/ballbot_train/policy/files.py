@@ -13,9 +13,9 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
-from ballbot_gym.identity import digest, observation_digest
 from ballbot_gym.robot import PAPER, ROBOT_FACTORS, ROBOTS, TRACKS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.identity import digest, observation_digest
 from ballbot_gym.tasks.symmetry import FRAMES, Frame
 
 OBSERVATION_VERSION = 1

@@ -16,11 +16,11 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.identity import observation_digest
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.robot import PAPER, ROBOT_FACTORS, ROBOTS, Randomization, Robot, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.identity import observation_digest
 from ballbot_gym.tasks.symmetry import REACH, Route
 from ballbot_train.policy.files import (
     OBSERVATION_VERSION,
@@ -37,7 +37,7 @@ with imports_of(__name__):
     import torch
 
 if TYPE_CHECKING:
-    from ballbot_gym.batch import BatchState
+    from ballbot_gym.vector.batch import BatchState
 
 _TOLD = len(ROBOT_FACTORS)
 _TOLD_SCALE = 0.3  # of the robot's parameters minus 1, as inputs of informed policies

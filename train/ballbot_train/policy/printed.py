@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ballbot_gym.codegen import OPERATIONS
 from ballbot_gym.lazy import imports_of
+from ballbot_gym.machine_code.codegen import OPERATIONS
 from ballbot_gym.tasks.symmetry import REACH
 from ballbot_train.policy.network import PolicyNetwork
 

@@ -14,11 +14,11 @@ import numpy as np
 from gymnasium import spaces
 
 from ballbot_gym import files
-from ballbot_gym.identity import observation_digest
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.robot import Robot
 from ballbot_gym.step import observation_space
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import observation_digest
 from ballbot_train.policy.files import PolicyError
 from ballbot_train.policy.weights import checked, linear_layers, saved_by_torch
 

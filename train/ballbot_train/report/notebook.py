@@ -12,9 +12,9 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from ballbot_gym import files
-from ballbot_gym.display import Moving
 from ballbot_gym.robot import Robot, checked_robot
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.trajectory import Moving
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Replay, Take, playable
@@ -23,7 +23,7 @@ _HEIGHT = 520  # px of a replay below a cell
 
 
 def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Robot) -> Path | None:
-    """See `ballbot_gym.display.Moving.show`."""
+    """See `ballbot_gym.trajectory.Moving.show`."""
     takes = tuple(replace(take, trajectory=playable(take.trajectory, take.label)) for take in _takes(shown, names))
     title = " and ".join(take.label for take in takes)
     page = report_page(title, [Replay(title, takes, _markers(shown), checked_robot(robot))])
@@ -39,7 +39,7 @@ def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Rob
 
 
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
-    """See `ballbot_gym.display.Moving.plot`."""
+    """See `ballbot_gym.trajectory.Moving.plot`."""
     figure = figures.trajectory_figure("", _takes(shown, names), _markers(shown))
     figures.plain(figure)
     if _in_notebook():  # so that it shows figures as pictures, also those that pyplot did not make

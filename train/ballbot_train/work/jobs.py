@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
-from ballbot_gym.identity import changed_parts
 from ballbot_gym.lazy import imports_of
+from ballbot_gym.tasks.identity import changed_parts
 from ballbot_train.work.console import progress_bars
 from ballbot_train.work.executors import Workers, completed
 

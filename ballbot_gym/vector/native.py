@@ -1,7 +1,7 @@
 """BallbotNative: what `BallbotBatch` does without gradients, in machine code that is compiled once per task and robot.
 
 `codegen` writes the C code, `machine_code` compiles it within a second or two, and it serves batches of all sizes. Episodes
-are those of `BallbotBatch`: the same `counter_rng` numbers for the same seeds. Motions agree to rounding. They are
+are those of `BallbotBatch`: the same `seeding` numbers for the same seeds. Motions agree to rounding. They are
 bit-identical for any size of the batch and any place of the env in it.
 """
 
@@ -18,14 +18,14 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import machine_code
-from ballbot_gym.autoreset import Info, Step, info_of, step_result
-from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
-from ballbot_gym.identity import problem_digest
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import problem_digest
+from ballbot_gym.vector.autoreset import Info, Step, _as_gymnasium, _info_of
+from ballbot_gym.vector.state import BatchState
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
@@ -173,7 +173,7 @@ class BallbotNative:
             rows = rows[self._reported_rows :]
             end = self._info(old._replace(x=rows[: self.params.state_size]), rows, pay[5:], flags[6:], violated)
             last = last.take(ended, 0)
-        return step_result(observation, pay[0], flags[0], flags[1], now, end, last)
+        return _as_gymnasium(observation, pay[0], flags[0], flags[1], now, end, last)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
         """What a step from a state computes, and whether an action is not finite."""
@@ -211,7 +211,7 @@ class BallbotNative:
         grip = pulls + self.params.action_size
         force, (success, failure, clipped) = rows[pulls:grip], flags[:3]
         did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._reported_rows]
-        return info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
+        return _info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and their measurements, a row (B,) each."""
@@ -261,7 +261,7 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
 
     For example, a symbol that is converted to a float silently becomes NaN.
     """
-    from ballbot_gym.array_batch import BallbotArrays  # a subclass of this module's class
+    from ballbot_gym.vector.arrays import BallbotArrays  # a subclass of this module's class
 
     dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
@@ -297,7 +297,7 @@ def _source(task: Task, params: Robot, double: bool) -> str:
     """
     if find_spec("casadi") is None and (written := machine_code.shipped_source(code_name(task, params, double))):
         return written
-    from ballbot_gym import codegen  # it imports CasADi
+    from ballbot_gym.machine_code import codegen  # it imports CasADi
 
     return codegen.source(task, params, double)
 

@@ -2,7 +2,7 @@
 
 Components come first: a batch of B states is a tensor (8, B), so that every operation runs over contiguous memory.
 
-Random numbers come from `counter_rng`; `BallbotEnv` draws others, from NumPy's generator, for the same seed.
+Random numbers come from `seeding`; `BallbotEnv` draws others, from NumPy's generator, for the same seed.
 Eager batches give bit-identical results for the same seed and actions, and so do compiled batches of two or more envs. Eager
 and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from ballbot_gym import counter_rng
-from ballbot_gym.batch_state import BatchState, check_starts
+from ballbot_gym import seeding
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.lazy import imports_of
@@ -32,6 +31,7 @@ from ballbot_gym.robot import (
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import check_observation, limit_names, step
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.state import BatchState, _check_starts
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -142,7 +142,7 @@ class BallbotBatch:
             TypeError: a keyword that is no field of the task.
         """
         check_num_envs(num_envs)
-        dtype = dtype_named(dtype)
+        dtype = _dtype_named(dtype)
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
         if compile not in (True, False, "auto"):
@@ -244,7 +244,7 @@ class BallbotBatch:
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c, drawn)
         if x is not None:
-            check_starts(self.task, new.x, new.c, mask)
+            _check_starts(self.task, new.x, new.c, mask)
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
 
     def _check_tensor(self, given: Any, shape: tuple[int, ...], what: str) -> None:
@@ -313,8 +313,8 @@ class BallbotBatch:
         asked = actions.to(self.dtype).unbind(-1)
         z = ()
         if noise.pushes:
-            key = counter_rng.key(state.seed, state.episode, state.steps + 1)
-            z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS, self.dtype)
+            key = seeding.key(state.seed, state.episode, state.steps + 1)
+            z = seeding.uniforms(key, Randomization.PUSH_DRAWS, self.dtype)
         made = step(
             task,
             self.params,
@@ -340,7 +340,7 @@ class BallbotBatch:
             past = (*self._seen(now), *tried, *past)[: len(past)]
         read = now.sensors
         if read:
-            z = counter_rng.uniforms(counter_rng.key(state.seed, state.episode, steps), sensors.DRAWS, self.dtype)
+            z = seeding.uniforms(seeding.key(state.seed, state.episode, steps), sensors.DRAWS, self.dtype)
             read = sensors.following(self.model(now.drawn), read, x, made.total, end, z, task.control_dt)
         after = now._replace(x=end, steps=steps, actuator=made.actuator, past=past, sensors=read)
         new, observed = after, self._observe(after)
@@ -411,11 +411,11 @@ class BallbotBatch:
     ) -> _Rows:
         """The starts of episodes; x, c and what the randomization draws are drawn where they are not given."""
         task, noise = self.task, self.randomization
-        key = counter_rng.key(seed, episode, 0 * episode)
+        key = seeding.key(seed, episode, 0 * episode)
         varied = noise.varies_episodes
         senses = self.observation == "sensors"
         count = task.constant_draws + task.state_draws + noise.episode_draws * varied + sensors.FIRST_DRAWS * senses
-        z = counter_rng.uniforms(key, count, self.dtype)
+        z = seeding.uniforms(key, count, self.dtype)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
         state = task.start(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
@@ -445,8 +445,8 @@ class BallbotBatch:
     def _sensed(self, now: _Rows) -> tuple[torch.Tensor, ...]:
         if not self.randomization.is_noisy:
             return now.x
-        key = counter_rng.key(now.seed, now.episode, now.steps + 1)
-        z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
+        key = seeding.key(now.seed, now.episode, now.steps + 1)
+        z = seeding.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
         time = now.steps.to(self.dtype) * self.task.control_dt
         return self.randomization.sensed(now.x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
 
@@ -503,6 +503,6 @@ def _described(value: Any) -> str:
     return f"one of shape {tuple(value.shape)}, {value.dtype}" if isinstance(value, torch.Tensor) else shown(value)
 
 
-def dtype_named(dtype: Any) -> Any:
+def _dtype_named(dtype: Any) -> Any:
     """A dtype that may be given by its name, as in a spec that was JSON."""
     return {"float32": torch.float32, "float64": torch.float64}.get(dtype, dtype) if isinstance(dtype, str) else dtype

@@ -25,7 +25,7 @@ static void draw_constants(const real *restrict z, int64_t sz, real *restrict c,
 /* random numbers, constants -> states */
 static void draw_state(const real *restrict z, int64_t sz, const real *restrict c, int64_t sc, real *restrict x, int64_t sx);
 
-/* Random numbers, as in counter_rng.py. */
+/* Random numbers, as in seeding.py. */
 static uint32_t mix(uint32_t word) {
     word = (word ^ (word >> 16)) * 0x21F0AAADu;
     word = (word ^ (word >> 15)) * 0x735A2D97u;

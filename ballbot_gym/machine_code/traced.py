@@ -12,7 +12,7 @@ FLAGS = ("-O2", "-ffp-contract=off", "-fno-builtin")
 """Of compilers, which must neither fuse a product and a sum nor join a sine and a cosine."""
 
 
-class Number:
+class _Number:
     """A float64 that C code will have; a truth value is 1 or 0. Python cannot branch on it."""
 
     __array_ufunc__ = None  # so that NumPy's floats leave the operators to this class
@@ -21,10 +21,10 @@ class Number:
         """Args: name: its name in C. lines: what C computes, an expression in each line, with the names of the results."""
         self.name, self.lines = name, lines
 
-    def made(self, form: str, *others: Any) -> "Number":
+    def made(self, form: str, *others: Any) -> "_Number":
         """The number that an expression gives of this one, {0}, and of others, {1} and so on."""
         expression = form.format(self.name, *(_name(other) for other in others))
-        return Number(self.lines.setdefault(expression, f"v{len(self.lines)}"), self.lines)
+        return _Number(self.lines.setdefault(expression, f"v{len(self.lines)}"), self.lines)
 
     __hash__: Any = None
 
@@ -32,7 +32,7 @@ class Number:
         raise TypeError("a traced number is neither true nor false; take ops.where")
 
 
-def _operation(form: str) -> Callable[..., Number]:
+def _operation(form: str) -> Callable[..., _Number]:
     return lambda number, *others: number.made(form, *others)
 
 
@@ -56,29 +56,29 @@ _OPERATORS = {
     "ne": "{0} != {1}",
 }
 for _name_of, _form in _OPERATORS.items():
-    setattr(Number, f"__{_name_of}__", _operation(_form))
+    setattr(_Number, f"__{_name_of}__", _operation(_form))
 
 # the functions of `ops` under their names
 _FUNCTIONS = ("sin({0})", "cos({0})", "sqrt({0})", "exp({0})", "log({0})", "acos({0})", "atan({0})")
 sin, cos, sqrt, exp, log, arccos, arctan = map(_operation, _FUNCTIONS)
 
 
-def where(condition: Number, a: Any, b: Any) -> Number:
+def where(condition: _Number, a: Any, b: Any) -> _Number:
     """a where the condition holds, else b."""
     return condition.made("{0} != 0 ? {1} : {2}", a, b)
 
 
-def minimum(a: Number, b: Any) -> Number:
+def minimum(a: _Number, b: Any) -> _Number:
     """The lesser of two numbers."""
     return a.made("{1} < {0} ? {1} : {0}", b)
 
 
-def maximum(a: Number, b: Any) -> Number:
+def maximum(a: _Number, b: Any) -> _Number:
     """The greater of two numbers."""
     return a.made("{1} > {0} ? {1} : {0}", b)
 
 
-def clip(a: Number, low: Any, high: Any) -> Number:
+def clip(a: _Number, low: Any, high: Any) -> _Number:
     """The nearest number in [low, high], as max(min(a, high), low)."""
     below = a.made("{1} < {0} ? {1} : {0}", high)
     return below.made("{1} > {0} ? {1} : {0}", low)
@@ -97,10 +97,10 @@ def function(name: str, compute: Callable[..., Sequence[Any]], counts: Sequence[
         in_place: whether the results replace the first arguments.
 
     Raises:
-        Exception: any error of a `compute` that cannot compute with a `Number`.
+        Exception: any error of a `compute` that cannot compute with a `_Number`.
     """
     lines: dict[str, str] = {}
-    given = [Number(f"a{i}", lines) for i in range(sum(counts))]
+    given = [_Number(f"a{i}", lines) for i in range(sum(counts))]
     starts = [sum(counts[:i]) for i in range(len(counts))]
     results = compute(*(tuple(given[at : at + count]) for at, count in zip(starts, counts, strict=True)))
     first = 1 if in_place else 1 + len(results)
@@ -114,7 +114,7 @@ def function(name: str, compute: Callable[..., Sequence[Any]], counts: Sequence[
 
 def _name(value: Any) -> str:
     """A traced or an ordinary number in C."""
-    if isinstance(value, Number):
+    if isinstance(value, _Number):
         return value.name
     number = float(value)
     if math.isnan(number):

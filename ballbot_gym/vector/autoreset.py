@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ballbot_gym.batch_state import BatchState
 from ballbot_gym.checks import check_finite
+from ballbot_gym.vector.state import BatchState
 
 if TYPE_CHECKING:
     import torch
 
-    from ballbot_gym.batch import BallbotBatch, BatchStep
+    from ballbot_gym.vector.batch import BallbotBatch, BatchStep
 
 _NOTHING_DONE = ("reward", "cost", "terminated", "truncated", "success", "failure", "force", "clipped", "grip")
 """Fields of a `BatchStep` that are 0 of an env that waits."""
@@ -49,7 +49,7 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
         result: Any = _advance(batch, torch.from_numpy(actions).to(batch.device), waiting)
         state: Any = batch.state
         measured, last_measured = map(batch.measurements, (state, state._replace(x=result.final_x)))
-    result = result._make(map(as_array, result))
+    result = result._make(map(_as_array, result))
     reward, cost = (part.astype(np.float64, copy=False) for part in (result.reward, result.cost))
     ended = (result.terminated | result.truncated).nonzero()[0]
     parts, survive = np.empty((3, batch.num_envs)), batch.task.survival_reward * batch.task.control_dt
@@ -66,13 +66,13 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
     violated, end = result.violated, None
     now = cost, parts, result.force, result.success, violated >= 0, result.clipped, result.grip
     if batch.restarts and ended.size:
-        end = info_of(before._replace(x=result.final_x), last_measured, violated, *now)
+        end = _info_of(before._replace(x=result.final_x), last_measured, violated, *now)
         now = tuple(_without(part, ended) for part in now)
-    info = info_of(state, measured, violated, *now)
-    return step_result(seen, reward, result.terminated, result.truncated, info, end, last[ended])
+    info = _info_of(state, measured, violated, *now)
+    return _as_gymnasium(seen, reward, result.terminated, result.truncated, info, end, last[ended])
 
 
-def step_result(
+def _as_gymnasium(
     observation: np.ndarray,
     reward: np.ndarray,
     terminated: np.ndarray,
@@ -94,13 +94,13 @@ def step_result(
     infos: dict[str, Any] = {}
     if end is not None:
         done = terminated | truncated
-        infos = {"final_info": masked(end, done), "final_obs": np.full(observation.shape, np.nan, np.float32)}
+        infos = {"final_info": _masked(end, done), "final_obs": np.full(observation.shape, np.nan, np.float32)}
         infos["final_obs"][np.flatnonzero(done)] = last
         infos["_final_info"] = infos["_final_obs"] = done
-    return observation, reward, terminated, truncated, infos | masked(now, filled(True, len(reward)))
+    return observation, reward, terminated, truncated, infos | _masked(now, _filled(True, len(reward)))
 
 
-def masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
+def _masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
     """An info with Gymnasium's masks (B,) of valid entries."""
     return info | dict.fromkeys([f"_{name}" for name in info], mask)
 
@@ -121,7 +121,7 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
     )
 
 
-def info_of(
+def _info_of(
     state: Any,
     measured: dict[str, np.ndarray],
     violated: np.ndarray,
@@ -145,10 +145,10 @@ def info_of(
         success, failure, clipped: (B,) bool.
         grip: (4, B), same as in `BatchStep`; (0, B) where friction is unlimited.
     """
-    x, c, drawn = as_array(state.x).T, as_array(state.c).T, as_array(state.drawn)
+    x, c, drawn = _as_array(state.x).T, _as_array(state.c).T, _as_array(state.drawn)
     size = len(cost)
     failed = np.count_nonzero(failure)
-    violated = violated if failed else filled(-1, size)
+    violated = violated if failed else _filled(-1, size)
     x.flags.writeable = c.flags.writeable = violated.flags.writeable = False
     info = {
         "state": x,
@@ -161,7 +161,7 @@ def info_of(
         "is_success": success,
         "failure": failure,
         "violated": violated,
-        "constraint_cost": failure.astype(np.float64) if failed else filled(0.0, size),
+        "constraint_cost": failure.astype(np.float64) if failed else _filled(0.0, size),
         "force": force.T,
         "clipped": clipped,
         "constants": c,
@@ -174,14 +174,14 @@ def info_of(
 
 
 @lru_cache(maxsize=16)
-def filled(value: Any, size: int) -> np.ndarray:
+def _filled(value: Any, size: int) -> np.ndarray:
     """A read-only array (size,) of one value."""
     array = np.full(size, value)
     array.flags.writeable = False
     return array
 
 
-def as_array(part: Any) -> np.ndarray:
+def _as_array(part: Any) -> np.ndarray:
     """A tensor, or an array, as an array."""
     return part if isinstance(part, np.ndarray) else part.detach().cpu().numpy()
 

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.env import make_task
 from ballbot_gym.robot import Robot, first_of_kind, named_robot
-from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.base import Task
 
 _PROBES = 8  # episodes at which a task is compared
 _SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)  # m, rad and per second, of states at which it is compared
@@ -70,11 +69,6 @@ def problem_parts(task: Task, params: Robot) -> dict[str, str]:
 def problem_digest(task: Task, params: Robot) -> str:
     """One digest of all parts of a problem."""
     return digest(problem_parts(task, params))
-
-
-def named_problem(task: str, robot: str) -> dict[str, str]:
-    """`problem_parts` of a task and a robot by name."""
-    return problem_parts(make_task(task, robot), named_robot(robot))
 
 
 def changed_parts(held: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:

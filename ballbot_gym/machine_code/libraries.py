@@ -151,7 +151,7 @@ def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, .
     """
     code = built.with_suffix(".c")
     code.write_text(source, encoding="utf-8")
-    own = flags if is_gcc(compiler) else without_parameters(flags)
+    own = flags if _is_gcc(compiler) else without_parameters(flags)
     _run([compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES], _COMPILE_SECONDS, check=True)
 
 
@@ -236,7 +236,7 @@ def compiler() -> str | None:
 
 
 @cache
-def is_gcc(compiler: str) -> bool:
+def _is_gcc(compiler: str) -> bool:
     """Whether a compiler is GCC. On macOS, clang is called gcc too."""
     return "Free Software Foundation" in _version(compiler)
 

@@ -10,7 +10,7 @@ from ballbot_gym.lazy import imports_of
 with imports_of(__name__):
     import torch
 
-    from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.vector.batch import BallbotBatch
 
 
 class BatchEpisodes(NamedTuple):

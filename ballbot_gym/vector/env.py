@@ -14,9 +14,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ballbot_gym.array_batch import BallbotArrays
-from ballbot_gym.autoreset import as_array, filled, info_of, masked, step
-from ballbot_gym.batch_state import BatchState, check_starts
 from ballbot_gym.checks import (
     check_constant_names,
     check_finite,
@@ -31,15 +28,18 @@ from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task, robot_of
 from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
-from ballbot_gym.native import BallbotNative
 from ballbot_gym.robot import PAPER, Randomization, Robot, checked_randomization
 from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.arrays import BallbotArrays
+from ballbot_gym.vector.autoreset import _as_array, _filled, _info_of, _masked, step
+from ballbot_gym.vector.native import BallbotNative
+from ballbot_gym.vector.state import BatchState, _check_starts
 
 if TYPE_CHECKING:
     import torch
 
-    from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.vector.batch import BallbotBatch
 
 _ENGINES = ("auto", "native", "torch", "numpy")
 
@@ -171,16 +171,16 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         if x is not None:
             state = self._with_x(state, x, mask)
         self.batch.state = state
-        observation, measured = as_array(self.batch.observe(state)), self.batch.measurements(state)
+        observation, measured = _as_array(self.batch.observe(state)), self.batch.measurements(state)
         self._ended = self._ended & ~mask
         force, grip = (
             np.zeros((rows, self.num_envs), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips)
         )
         cost, parts = np.zeros(self.num_envs), np.zeros((3, self.num_envs))
         success, failure, clipped = np.zeros((3, self.num_envs), bool)
-        none = filled(-1, self.num_envs)
-        info = info_of(state, measured, none, cost, parts, force, success, failure, clipped, grip)
-        return observation.astype(np.float32, copy=False), masked(info, mask)
+        none = _filled(-1, self.num_envs)
+        info = _info_of(state, measured, none, cost, parts, force, success, failure, clipped, grip)
+        return observation.astype(np.float32, copy=False), _masked(info, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -217,7 +217,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         if name == "np_random_seed":
             return self.np_random_seed
         if name == "episode_params":
-            varied, drawn = self.randomization.varies_robot, as_array(self._state.drawn).T.tolist()
+            varied, drawn = self.randomization.varies_robot, _as_array(self._state.drawn).T.tolist()
             return tuple(self.randomization.robot(self.params, tuple(row)) if varied else self.params for row in drawn)
         return (getattr(self, name),) * self.num_envs
 
@@ -272,7 +272,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
         """(nc, B) constants: those given, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
-        c = as_array(drawn.c).astype(np.float64)
+        c = _as_array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
             check_constant_names(task, constants)
             for name, value in constants.items():
@@ -281,14 +281,14 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             c[:] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True).T
         for distinct in np.unique(c[:, mask], axis=1).T:
             task.check_constants(distinct, self.params)
-        return self._to_batch(c.astype(as_array(drawn.c).dtype))
+        return self._to_batch(c.astype(_as_array(drawn.c).dtype))
 
     def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
         """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
-        drawn, c = as_array(state.x), as_array(state.c)
+        drawn, c = _as_array(state.x), _as_array(state.c)
         wanted = finite_array(given, (self.num_envs, self.params.state_size), "state", broadcast=True).T
         x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
-        check_starts(self.task, tuple(x), tuple(c), mask)
+        _check_starts(self.task, tuple(x), tuple(c), mask)
         return state._replace(x=self._to_batch(x))
 
 
@@ -305,7 +305,7 @@ def _in_torch(
     """The batch of envs if torch is installed. The arguments are those of `BallbotVectorEnv`."""
     import torch
 
-    from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.vector.batch import BallbotBatch
 
     cpu = torch.device(device).type == "cpu"
     if engine in ("native", "numpy") and not cpu:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import counter_rng, ops
-from ballbot_gym.native import FLAG_ROWS, BallbotNative, Computed, State
+from ballbot_gym import ops, seeding
 from ballbot_gym.robot import Robot
 from ballbot_gym.step import step
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector.native import FLAG_ROWS, BallbotNative, Computed, State
 
 _REWARD, _COST, _SURVIVE, _RUNNING, _GOAL = range(5)  # rows of what is paid
 _TERMINATED, _TRUNCATED, _SUCCESS, _FAILURE, _CLIPPED, _DONE = range(FLAG_ROWS)
@@ -39,7 +39,7 @@ class BallbotArrays(BallbotNative):
     def _drawn(self, seed: np.ndarray, episode: np.ndarray, c: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The states and constants with which episodes start; the constants are drawn unless they are given."""
         task, count = self.task, self.task.constant_draws
-        z = counter_rng.uniforms(counter_rng.key(seed, episode, 0), count + task.state_draws, self.dtype)
+        z = seeding.uniforms(seeding.key(seed, episode, 0), count + task.state_draws, self.dtype)
         if c is None:
             c = self._rows(task.draw_constants(z[:count], self.params), len(seed))
         return self._rows(task.start(z[count:], tuple(c), self.params), len(seed)), c

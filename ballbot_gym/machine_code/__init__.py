@@ -1,0 +1,34 @@
+"""Machine code: C code of what tasks and robots compute, and how it becomes shared libraries.
+
+`codegen` writes C for many robots at once, `traced` and `step_code` for a single one, and `libraries` compiles it.
+"""
+
+from ballbot_gym.machine_code.libraries import (
+    LEVELS,
+    SUFFIX,
+    NoMachineCodeError,
+    cache_folder,
+    check_private,
+    compile_library,
+    compiler,
+    content_key,
+    kept,
+    library,
+    shipped_source,
+    without_parameters,
+)
+
+__all__ = [
+    "LEVELS",
+    "SUFFIX",
+    "NoMachineCodeError",
+    "cache_folder",
+    "check_private",
+    "compile_library",
+    "compiler",
+    "content_key",
+    "kept",
+    "library",
+    "shipped_source",
+    "without_parameters",
+]
