@@ -45,7 +45,7 @@ class Moving(Displayed):
         """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.
 
         Args:
-            others: trajectories, episodes or optima to show beside it.
+            others: trajectories, episodes or optima to show next to it.
             labels: a name for each; default, what they are.
             robot: what is drawn, a name in `ROBOTS` or its parameters.
 
@@ -59,7 +59,7 @@ class Moving(Displayed):
         return lazy.load("ballbot_train.report.notebook:show_motions")((self, *others), labels, robot)
 
     def plot(self, *others: "Moving", labels: Sequence[str] = ()) -> Any:
-        """A matplotlib Figure of positions, velocities, leans, forces and the path. Arguments and errors: as of `show`."""
+        """A matplotlib Figure of positions, velocities, leans, forces and the path. For arguments and errors see `show`."""
         return lazy.load("ballbot_train.report.notebook:plot_motions")((self, *others), labels)
 
 

@@ -43,7 +43,7 @@ def planned(name: str, seed: int, indices: Sequence[int]) -> Iterator[jobs.Entry
         entry: jobs.Entry = {"episode": i, "seconds": time.process_time() - start, "error": error}
         if optimum is not None:
             entry |= {"status": optimum.status, "cost": optimum.cost}
-        if optimum is not None and name == "weave" and i < _COMPARED:
+        if optimum is not None and task.passed_obstacles(c) is not None and i < _COMPARED:
             start = time.process_time()
             before = find_optimum(task, params, x0, c, paths=task.guess_paths(x0, c, params)[:_SHORTEST])
             entry |= {"seconds_before": time.process_time() - start, "cost_before": before.cost}

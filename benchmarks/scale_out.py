@@ -176,7 +176,7 @@ def certified_set(out: Path, workers: Workers, episodes: int) -> dict[str, np.nd
 
 
 def leaderboard(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
-    groups = [Group(task, "lqr", "rk4") for task in ("stabilize", "turn")]
+    groups = [Group("stabilize", "lqr", "rk4"), Group("turn", "lqr", "rk4")]
     done = run_groups(groups, episodes // 2, out, workers, record=True)
     return {
         name: np.array([getattr(row, name) for row in done])

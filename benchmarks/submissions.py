@@ -20,19 +20,16 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import certified, files, named_robot, ops
+from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
+from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.evaluation import judge, recordings, steering, submissions
 
 EPISODES = 3
-HONEST = [
-    (task, "lqr", physics, "paper")
-    for task in ("stabilize", "turn", "orbit", "weave")
-    for physics in ("rk4", "bullet", "mujoco")
-]
-HONEST += [
-    (task, "sac", physics, "paper") for task in ("stabilize", "orbit") for physics in ("rk4", "bullet", "mujoco")
-]
+HONEST = [(task, "lqr", physics, "paper") for task in TASKS for physics in PHYSICS]
+HONEST += [("stabilize", "sac", physics, "paper") for physics in PHYSICS]
+HONEST += [("orbit", "sac", physics, "paper") for physics in PHYSICS]
 HONEST += [("turn", "shac", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
 HONEST += [("stabilize", "lqr", physics, "kugle") for physics in ("bullet", "mujoco")]
 

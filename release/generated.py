@@ -99,7 +99,7 @@ def generated() -> Iterator[Code]:
         for task in TASKS:
             with recorded() as found:
                 environments(task, robot)
-                if ROBOTS[robot].params.wheels is None:
+                if not ROBOTS[robot].params.LONG_EQUATIONS:
                     experts(task, robot)
             yield from (code for code in found if code not in seen)
             seen |= set(found)
