@@ -12,6 +12,7 @@ from ballbot_gym import TASKS, Stabilize, certified, named_robot, ops
 from ballbot_gym.robot import (
     ROBOTS,
     ROLLING_URDF_PATH,
+    Registered,
     Robot,
     read_urdf,
     register_robot,
@@ -137,7 +138,7 @@ def test_a_run_is_not_continued_with_another_cost_or_another_robot(
         with pytest.raises(ValueError, match=r"another problem.*: its costs have changed since"):
             claim(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setitem(ROBOTS, "paper", Robot(replace(PAPER, body_mass=14.0), {}))
+        patch.setitem(ROBOTS, "paper", Registered(replace(PAPER, body_mass=14.0), {}))
         with pytest.raises(ValueError, match=r"another problem.*: its robot has changed since"):
             claim(tmp_path)
     jobs.unlock(tmp_path)
@@ -218,7 +219,7 @@ def test_training_a_robot_without_a_name_is_refused(tmp_path: Path, monkeypatch:
     for learner in LEARNERS.values():
         with pytest.raises(ValueError, match=r"this robot has no name.*register_robot"):
             learner.make(task, light, learner.settings("stabilize"), 0)
-    monkeypatch.setitem(ROBOTS, "light", Robot(light, {}))
+    monkeypatch.setitem(ROBOTS, "light", Registered(light, {}))
     made = apg.Apg(task, light, TINY)
     with pytest.raises(ValueError, match="""the learner trains 'light', and "robot" of config is 'paper'"""):
         training.train(made, task, {"learner": "apg", "task": "stabilize"}, tmp_path)
@@ -230,6 +231,6 @@ def test_a_robot_that_differs_in_its_friction_alone_has_its_own_name(monkeypatch
     assert robot_name(ice) == "rolling"
     with pytest.raises(ValueError, match="its numbers are not those of 'rolling'"):
         registered_name(ice)
-    monkeypatch.setitem(ROBOTS, "ice", Robot(ice, {}))
+    monkeypatch.setitem(ROBOTS, "ice", Registered(ice, {}))
     assert robot_name(ice) == registered_name(ice) == "ice"
     assert robot_name(named_robot("rolling")) == "rolling"

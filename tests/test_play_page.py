@@ -89,7 +89,7 @@ def test_a_robot_with_wheels_is_chosen_and_what_it_has_not_is_said(opened, visit
     visitor.ask("push", [5.0, 0.0])
     wait_for(lambda: opened.playground.shown_push is not None)
     visitor.ask("impulse of pushes on the ball, one in 2 s, N·s", 2.0)
-    wait_for(lambda: "which a robot with wheels does not have" in visitor.value("text"))
+    wait_for(lambda: "which Omni does not have" in visitor.value("text"))
     opened.goes_on()
 
 

@@ -128,7 +128,7 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
     measured = described["measured"]
     assert measured["physics"] == default_physics()
     assert measured["episodes"] == 200
-    episodes = 1 if named_robot(robot).wheels else 2  # with wheels an episode takes a second
+    episodes = 1 if named_robot(robot).LONG_EQUATIONS else 2  # with wheels an episode takes a second
     row = evaluate(learner, name, episodes, robot=robot)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_mean < 3 * max(measured["regret_mean"], 0.01)

@@ -17,7 +17,7 @@ from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import TASKS, Task, certified, files, named_robot, register_robot, register_task
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import ROBOTS, URDF_PATH, UrdfError, read_urdf
+from ballbot_gym.robot import ROBOTS, URDF_PATH, UrdfError, read_urdf, urdf_text
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.new import files_of
@@ -37,7 +37,7 @@ def module(tmp_path, monkeypatch):
 def light(tmp_path):
     """The path of the URDF of a lighter robot."""
     path = tmp_path / "light.urdf"
-    path.write_text(replace(named_robot("paper"), body_mass=10.0).to_urdf())
+    path.write_text(urdf_text(replace(named_robot("paper"), body_mass=10.0)))
     return path
 
 

@@ -160,7 +160,6 @@ def test_costs_of_the_submitter_s_are_refused(submitted, tmp_path, forge):
         ({"link": "https://github.com@b.org"}, "link must be an address"),
         ({"link": "https://"}, "link must be an address"),
         ({"task": "../../a"}, "unknown task"),
-        ({"robot": "omni"}, "omni has wheels, and recordings have no heading"),
         ({"name": "<b>mine</b>"}, "name must be of letters"),
         ({"name": "m" * 41}, "name must be text of at most 40"),
         ({"task": "os:system"}, "unknown task 'os:system'"),

@@ -80,12 +80,12 @@ GOOD = {"t": [0.0, 1.0], "x": np.zeros((2, 8)), "u": np.zeros((1, 2))}
 
 BAD_ARRAYS = {
     "too few states": ({"x": np.zeros((1, 8))}, r"x \(1, 8\) must be"),
-    "seven states": ({"x": np.zeros((2, 7))}, r"\(2, 7\)"),
+    "no components": ({"x": np.zeros((2, 0))}, r"\(2, 0\)"),
     "flat states": ({"x": np.zeros(8)}, r"\(8,\)"),
     "matrix of times": ({"t": np.zeros((2, 1))}, r"t \(2, 1\)"),
     "scalar time": ({"t": 0.0}, "t"),
     "no times": ({"t": [], "x": np.zeros((0, 8)), "u": np.zeros((0, 2))}, "t"),
-    "too many forces": ({"u": np.zeros((3, 2))}, r"u \(3, 2\) must be \(1, 2\), held, or \(2, 2\), linear"),
+    "too many forces": ({"u": np.zeros((3, 2))}, r"u \(3, 2\) must be \(1, m\), held, or \(2, m\), linear"),
     "slopes of another shape": ({"xdot": np.zeros((1, 8))}, r"xdot \(1, 8\)"),
     "infinite": ({"x": np.full((2, 8), np.inf)}, "finite"),
     "NaN force": ({"u": [[np.nan, 0.0]]}, "finite"),
