@@ -15,7 +15,6 @@ from ballbot_gym.robot import (
     Registered,
     Robot,
     read_urdf,
-    register_robot,
     registered_name,
     robot_name,
 )
@@ -147,8 +146,8 @@ def test_a_run_is_not_continued_with_another_cost_or_another_robot(
 def test_a_run_is_not_continued_after_its_urdf_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = {"mine": {"stabilize": ["lqr"]}}
     for mass in ("12", "14"):
-        monkeypatch.delitem(ROBOTS, "mine", raising=False)
-        register_robot("mine", edited(ROLLING_URDF_PATH, tmp_path / "robot.urdf", mass))
+        robot = read_urdf(edited(ROLLING_URDF_PATH, tmp_path / "robot.urdf", mass))
+        monkeypatch.setitem(ROBOTS, "mine", Registered(robot, {}))
         if mass == "14":
             with pytest.raises(ValueError, match="another problem stabilize: its robot has changed since"):
                 open_run(tmp_path / "run", 1, chosen, "mine", episodes=5)

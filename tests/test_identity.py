@@ -153,7 +153,7 @@ def test_a_run_continues_with_the_same_problem_alone(tmp_path: Path, monkeypatch
     unfinished.mkdir(exist_ok=True)
     (unfinished / "job.json").write_text("[]")
     open_run(tmp_path, 1, chosen, episodes=5)
-    monkeypatch.setitem(TASKS, "stabilize", Dearer)
+    monkeypatch.setitem(TASKS, "stabilize", type(named_as_stabilize(Dearer)))
     with pytest.raises(ValueError, match="another problem stabilize: its costs have changed since"):
         open_run(tmp_path, 1, chosen, episodes=5)
     jobs.unlock(tmp_path)

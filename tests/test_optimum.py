@@ -233,7 +233,7 @@ def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(p
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_within_a_solver_is_not_lost(number, monkeypatch):
     """CasADi prints a KeyboardInterrupt and goes on."""
-    from ballbot_baselines import ocp
+    from ballbot_baselines.solvers import ocp
 
     def interrupted(number, frame):
         raise KeyboardInterrupt
