@@ -136,8 +136,10 @@ def step(
     A pure function over `ops`: of floats, of NumPy arrays or torch tensors (B,), and of symbols from which C is printed.
 
     Args:
-        task, robot: the problem, with the nominal robot.
-        x, c: the state, and the constants of the episode, without the time.
+        task: the task.
+        robot: the nominal robot.
+        x: the state.
+        c: the constants of the episode, without the time.
         taken: control steps of the episode before this one.
         action: in units of the robot's force limit; clipped to [−1, 1].
         variation: what varies, and what it drew for the episode.

@@ -12,11 +12,22 @@ from gymnasium.utils.env_checker import check_env
 
 import ballbot_gym
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
-from ballbot_gym import BallbotBatch, BallbotEnv, BallbotVectorEnv, rollout
+from ballbot_gym import TASKS, BallbotBatch, BallbotEnv, BallbotVectorEnv, rollout
+from ballbot_gym.robot import ROBOTS
 from ballbot_train import evaluate
 from ballbot_train.cli import _run as main
 
 FILE = Path(__file__).parent.parent / "examples" / "cart_pole.py"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    """What the example registers is gone after these tests."""
+    yield
+    TASKS.pop("swing_up", None)
+    ROBOTS.pop("cart_pole", None)
+    gymnasium.registry.pop("CartPoleSwingUp-v0", None)
+    sys.modules.pop("cart_pole", None)
 
 
 @pytest.fixture(scope="module")

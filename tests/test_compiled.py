@@ -1,4 +1,5 @@
 import ctypes
+import logging
 import multiprocessing
 import os
 import subprocess
@@ -60,7 +61,7 @@ def blocks():
 def test_lanes_give_the_values_of_every_stage(folder, caplog):
     (turned, product), x, y = blocks()
     fast_turned, fast_product = compiled.in_lanes("blocks", (turned, product))
-    assert not caplog.records
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
     none = np.zeros((0, compiled.LANES))
     for k in range(compiled.LANES):
         for expected, found in zip(turned(x[:, k], [], y[:, k]), fast_turned(x, none, y), strict=True):
@@ -118,7 +119,7 @@ def test_library_that_cannot_be_written_or_loaded_leaves_functions_interpreted(f
     folder.write_text("a file where the folder should be")
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
-    assert len(caplog.records) == 1
+    assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) == 1
 
     def refuse(*args):
         raise RuntimeError("wrong ELF class")
@@ -162,7 +163,7 @@ def test_compiler_that_is_none_leaves_functions_interpreted(fake_compiler, caplo
     fake_compiler(content)
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
-    assert len(caplog.records) == 1
+    assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) == 1
     assert "powers stay interpreted" in caplog.text
 
 
@@ -178,7 +179,7 @@ def test_compiler_that_hangs_is_given_up_and_not_asked_again(fake_compiler, monk
     assert f"{program} did not answer within 0.2 s" in caplog.text
     monkeypatch.setattr(libraries, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
     assert compiled.compiled("others", functions) is functions
-    assert len(caplog.records) == 1
+    assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) == 1
 
 
 @needs_compiler
@@ -193,7 +194,7 @@ def test_without_a_home_directory_functions_stay_interpreted(monkeypatch, caplog
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
     assert "home directory" in caplog.text
-    assert len(caplog.records) == 1
+    assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) == 1
 
 
 @posix
