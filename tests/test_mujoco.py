@@ -13,7 +13,7 @@ from ballbot_gym.tasks import Stabilize
 pytest.importorskip("mujoco")
 
 SPREAD = np.array([0.5, 0.5, 0.2, 0.2, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
-"""Of drawn starts, as `Ballbot.OMNI_STATE`."""
+"""Of drawn starts, as `Omni.STATE`."""
 
 
 def drawn(robot, rng, steps=25):

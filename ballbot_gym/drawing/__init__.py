@@ -99,9 +99,7 @@ class Pose(NamedTuple):
 
 def pose(params: Any, x: np.ndarray) -> Pose:
     """The pose of a ballbot in state x (8,). γ turns the body about the y axis, then θ about the turned −x axis."""
-    ball = np.array([x[0], x[1], params.ball_radius])
-    gamma, theta = x[2], x[3]
-    axis = np.array([math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)])
+    ball, axis = params.placed(x)
     body = ball + params.com_height * axis
     return Pose(ball, body, body + params.body_length / 2 * axis)
 

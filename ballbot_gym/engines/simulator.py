@@ -7,7 +7,7 @@ from ballbot_gym.ops import is_number
 from ballbot_gym.robot import Robot
 
 State = tuple[float, ...]
-"""(8,) state as a tuple of floats, or (11,) with wheels; order and units in `Ballbot.STATE` and `OMNI_STATE`."""
+"""(n,) state as a tuple of floats; order and units in the robot's `STATE`."""
 
 MOST_FRICTION = 1e3
 """What engines of contact take for unlimited friction."""

@@ -301,10 +301,14 @@ class Ballbot(_Derived, Robot):
     def position(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(x)[:2]
 
-    def shapes(self, x: np.ndarray) -> list[Shape]:
-        ball = np.array([x[0], x[1], self.ball_radius])
+    def placed(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(3,) centre of the ball, m, and (3,) unit vector along the body's axis, of state x (n,)."""
         gamma, theta = x[2], x[3]
         axis = np.array([math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)])
+        return np.array([x[0], x[1], self.ball_radius]), axis
+
+    def shapes(self, x: np.ndarray) -> list[Shape]:
+        ball, axis = self.placed(x)
         low = ball + (self.com_height - self.body_length / 2) * axis
         cap, top = low + _BODY_SHARE * self.body_length * axis, low + self.body_length * axis
         low, cap, top, centre = (tuple(point.tolist()) for point in (low, cap, top, ball))

@@ -58,15 +58,13 @@ class BallbotArrays(BallbotNative):
         return seen, self._rows(self.params.measurements(x), state.x.shape[1])
 
     def _advanced(self, old: State, actions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """One control step: rows of states, tilts, forces and grip; pay; flags; and violated limits."""
+        """One control step: rows of states, measurements, forces and grip; pay; flags; and violated limits."""
         task, params, size = self.task, self.params, self.num_envs
         x, c, a = tuple(old.x), tuple(old.c), tuple(actions.T)
         made = step(task, params, x, c, old.steps.astype(self.dtype), a)
-        did, reward, survive = made.outcome, made.reward, task.survival_reward * task.control_dt
-        running = np.where(did.violated >= 0, reward - survive, -did.cost)
-        goal = np.where(did.success > 0, reward - survive - running, 0) if task.first_exit else 0.0
+        did, survive = made.outcome, task.survival_reward * task.control_dt
         pay = np.empty((5, size))
-        for row, part in zip(pay, (reward, did.cost, survive, running, goal), strict=True):
+        for row, part in zip(pay, (made.reward, did.cost, survive, -did.running, did.goal), strict=True):
             row[:] = part
         flags = np.empty((FLAG_ROWS, size), bool)
         for row, part in zip(

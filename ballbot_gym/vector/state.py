@@ -15,7 +15,7 @@ class BatchState(NamedTuple):
     """Everything that a batch of B environments remembers."""
 
     x: torch.Tensor
-    """(8, B) states; order and units in `Ballbot.STATE`; with wheels (11, B), in `Ballbot.OMNI_STATE`."""
+    """(n, B) states; order and units in the robot's `STATE`."""
     c: torch.Tensor
     """(nc, B) constants of the running episodes."""
     steps: torch.Tensor

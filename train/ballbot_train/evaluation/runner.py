@@ -214,7 +214,7 @@ def _jobs_of(
 ) -> Iterator[jobs.Job]:
     """The jobs of a group, of `CHUNK` episodes each."""
     chosen = known[group.problem] if group.starts is None else _without_optima(group.starts)
-    sent, recorded = registry.portable(group.controller, *group.believed), record
+    sent = registry.portable(group.controller, *group.believed)
     words = "-".join(map(str, (group.task, group.controller, group.physics, *group.labels.values())))
     count = episodes if group.starts is None else len(group.starts)
     group = replace(group, starts=None)  # they are in the set
@@ -222,7 +222,7 @@ def _jobs_of(
         yield jobs.Job(
             name=f"{words}-{start:03d}",
             function=_episode_entries,
-            arguments=(group, sent, seed, chosen, recorded),
+            arguments=(group, sent, seed, chosen, record),
             items=tuple(range(start, min(start + CHUNK, count))),
             group=group.counts_for or group.task,
         )

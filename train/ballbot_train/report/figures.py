@@ -79,12 +79,13 @@ def trajectory_figure(
 
 
 def _components_figure(title: str, takes: Sequence[Take], robot: Robot) -> Figure:
-    shown = [*((each, True, i) for i, each in enumerate(robot.STATE))]
+    shown = [(each, True, i) for i, each in enumerate(robot.STATE)]
     shown += [(each, False, i) for i, each in enumerate(robot.ACTION)]
     columns = min(3, len(shown))
-    figure = Figure(figsize=(4 * columns, 2.6 * math.ceil(len(shown) / columns)), layout="constrained")
+    rows = math.ceil(len(shown) / columns)
+    figure = Figure(figsize=(4 * columns, 2.6 * rows), layout="constrained")
     figure.suptitle(title, fontsize=13)
-    axes = figure.subplots(math.ceil(len(shown) / columns), columns, squeeze=False, sharex=True).ravel()
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     for axis, (quantity, of_state, i) in zip(axes, shown, strict=False):
         for take in takes:
             motion = take.trajectory
