@@ -555,7 +555,7 @@ def make_task(task: str | Task, robot: str | Robot = PAPER, /, **task_fields: An
 
     Args:
         task: a name in `TASKS`, MODULE:NAME of one that a module registers, its id, or a Task.
-        robot: whose defaults the fields have: a name in `ROBOTS`, or a Robot.
+        robot: whose defaults the fields have: a name in `ROBOTS`, or a Robot; default, the robot that the task names.
         **task_fields: fields that replace the defaults.
 
     Raises:
@@ -567,7 +567,7 @@ def make_task(task: str | Task, robot: str | Robot = PAPER, /, **task_fields: An
             raise ValueError(f"fields {sorted(task_fields)} cannot be given together with a Task; use replace()")
         return task
     task = named_task(task)
-    own, given = named_robot(TASKS[task].ROBOT), checked_robot(robot)
+    own, given = named_robot(TASKS[task].ROBOT), robot_of(task, robot)
     family = [kind for kind in type(own).__mro__ if issubclass(kind, Robot)][-2]  # below Robot itself
     if not isinstance(given, family):
         raise ValueError(

@@ -88,14 +88,14 @@ def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
 
 
 def named_task(name: Any) -> str:
-    """The name in `TASKS` of a task that is given by it, by its id, or by MODULE:NAME.
+    """The name in `TASKS` of a task that is given by it, by its id or that of its counterpart, or by MODULE:NAME.
 
     Raises:
         ValueError: no task of that name.
     """
     known = {f"{kind.__module__}:{short}": short for short, kind in TASKS.items()}
     short = (known.get(name) or short_name(name)) if isinstance(name, str) else None
-    short = next((known for known, kind in TASKS.items() if kind.id == short), short)
+    short = next((known for known, kind in TASKS.items() if short and short in (kind.id, kind.counterpart)), short)
     if short not in TASKS:
         raise ValueError(
             f"unknown task {name!r}; known: {', '.join(map(repr, TASKS))}, or MODULE:NAME where your module calls "
@@ -179,7 +179,7 @@ def _check_class(kind: Any) -> None:
 
 def load_plugins() -> None:
     """Registers what installed packages announce. One that fails is left out with a warning that names it."""
-    for group in (TASKS_GROUP, ROBOTS_GROUP):
+    for group in (ROBOTS_GROUP, TASKS_GROUP):  # tasks name their robots
         for entry in metadata.entry_points(group=group):
             spec = getattr(sys.modules.get(entry.module), "__spec__", None)
             if getattr(spec, "_initializing", False):

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.robot import Randomization, Robot, substeps_for
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks.base import Task
 
 _LARGEST_OBSERVED = 1e6  # far beyond what any episode shows
@@ -110,10 +110,9 @@ Move = Callable[[Any, tuple[Any, ...], tuple[Any, ...]], tuple[tuple[Any, ...], 
 
 def closed_form(dt: float) -> Move:
     """How a robot moves over control steps of dt, s, by its equations of motion."""
-    substeps = substeps_for(dt)
 
     def move(robot: Any, x: tuple[Any, ...], u: tuple[Any, ...]) -> tuple[tuple[Any, ...], ...]:
-        return robot.step(x, u, dt, substeps), *robot.held(x, u, dt)
+        return robot.step(x, u, dt, robot.substeps(dt)), *robot.held(x, u, dt)
 
     return move  # pyright: ignore[reportReturnType]
 

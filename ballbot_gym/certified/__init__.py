@@ -7,6 +7,7 @@ robot: a cost divided by the optimum of something else is no regret.
 """
 
 import itertools
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +18,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.certified import cache, version
 from ballbot_gym.checks import shown
-from ballbot_gym.env import make_task
+from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.registry import name_of
 from ballbot_gym.robot import (
     PAPER,
@@ -28,10 +29,9 @@ from ballbot_gym.robot import (
     named_robot,
     robot_name,
     short_name,
-    substeps_for,
     track_of,
 )
-from ballbot_gym.tasks import Task
+from ballbot_gym.tasks import SHIPPED, Task
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_gym.trajectory import Trajectory
 
@@ -112,12 +112,18 @@ _PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "stat
 
 def named_problem(task: str, robot: str) -> dict[str, str]:
     """`problem_parts` of a task and a robot by name."""
-    return problem_parts(make_task(task, robot), named_robot(robot))
+    return problem_parts(make_task(task, robot), robot_of(task, robot))
 
 
 def path_of(task: Task, robot: str = PAPER, track: str = "") -> Path:
-    """Where the package keeps the evaluation set of a task, a robot by name and a track."""
-    return Path(__file__).parent / f"{file_name(task.id, robot)}{track and f'-{track}'}.npz"
+    """Where the package of a task keeps the evaluation set of the task, a robot by name and a track: here, or in the folder
+    `certified` beside the module of a task from outside.
+    """
+    folder, kind = Path(__file__).parent, type(task)
+    if kind not in SHIPPED:
+        module = getattr(sys.modules.get(kind.__module__), "__file__", None)
+        folder = folder if module is None else Path(module).parent / "certified"
+    return folder / f"{file_name(task.id, robot)}{track and f'-{track}'}.npz"
 
 
 def load(
@@ -141,7 +147,8 @@ def load(
             is damaged.
         ValueError: no task or robot of that name.
     """
-    params, name = checked_robot(robot), short_name(robot) if isinstance(robot, str) else robot_name(robot)
+    params = robot_of(task, robot)
+    name = short_name(robot) if isinstance(robot, str) and robot != PAPER else robot_name(params)
     task = make_task(task, name)
     needed = range(EPISODES) if episodes is None else list(episodes)
     if not randomization.moves_optima:
@@ -284,7 +291,7 @@ def _holds(arrays: Mapping[str, np.ndarray], task: Task, params: Robot, randomiz
     robot = randomization.robot(params, tuple(arrays["drawn"][number].T)) if randomization.moves_optima else params
     known = arrays["costs"][: len(lengths)]
     with np.errstate(all="ignore"):  # of damaged files
-        moved = np.abs(robot.step(before, u, dt, substeps_for(dt)) - after) <= _SAME
+        moved = np.abs(robot.step(before, u, dt, params.substeps(dt)) - after) <= _SAME
         found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, began), len(u)), len(known))
         kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, ended))
         return bool(moved.all() and (np.abs(found - known) <= _SAME * known).all() and kept)

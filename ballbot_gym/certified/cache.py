@@ -32,7 +32,7 @@ def episode(task: Task, params: Robot, index: int, draw: int = 0) -> tuple[np.nd
 
     A later draw replaces a draw whose goal a robot with limited friction cannot reach.
     """
-    seed = [zlib.crc32(task.id.encode()), index, *([draw] if draw else [])]
+    seed = [*task.episode_seed(index), *([draw] if draw else [])]
     return task.sample(np.random.default_rng(seed), params)
 
 
@@ -104,14 +104,15 @@ def _version(package: str) -> str:
 
 
 def _formulas(task: Task, params: Robot) -> str:
-    """What the task computes, as text."""
+    """What the task and the robot compute, as text."""
 
     def compute(x: tuple, u: tuple, c: tuple, z_constants: tuple, z_state: tuple) -> tuple[Any, ...]:
         drawn = (*task.draw_constants(z_constants, params), *task.draw_state(z_state, c[:constants], params))
-        return (task.cost(x, u, c), *task.margins(x, c), *task.goal(x, c), *drawn)
+        moved = params.step(x, u, task.control_dt, params.substeps(task.control_dt))
+        return (task.cost(x, u, c), *task.margins(x, c), *task.goal(x, c), *drawn, *moved)
 
     constants = len(task.constant_names)
-    counts = (8, 2, constants + task.clock, task.constant_draws, task.state_draws)
+    counts = (params.state_size, params.action_size, constants + task.clock, task.constant_draws, task.state_draws)
     try:
         return traced.function("problem", compute, counts)
     except Exception:  # users' code may raise any error when it gets a traced number

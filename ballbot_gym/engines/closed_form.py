@@ -2,7 +2,7 @@
 
 from ballbot_gym.engines.simulator import Simulator, State, check_kind, whole_substeps
 from ballbot_gym.machine_code import step_code
-from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.robot import Robot
 
 
 class Rk4Simulator(Simulator):
@@ -12,7 +12,7 @@ class Rk4Simulator(Simulator):
         """Args: as for `BulletSimulator`; physics_dt defaults to `RK4_STEP`."""
         self._params = params
         self._dt = control_dt
-        self._substeps = substeps_for(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
+        self._substeps = params.substeps(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
         self._each = range(self._substeps)  # made once: it is a hundredth of a step
         self._x: State = (0.0,) * params.state_size
         self._code: step_code.Work | None = None

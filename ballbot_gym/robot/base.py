@@ -78,6 +78,9 @@ class Robot(ABC):
     """Whether derivatives of a whole control step would take compilers minutes."""
     BATCHED_OPTIMA: ClassVar[bool] = False
     """Whether the optimizer of thousands of episodes at once was made for this kind."""
+    DISCRETE: ClassVar[bool] = False
+    """Whether `step` is overridden by a map over a control step of fixed length. It must then agree with `derivative` as to
+    which states are equilibria."""
     CONTACT: ClassVar[bool] = False
     """Whether engines of contact simulate the robot on a floor, where it may slip."""
     PUSHABLE: ClassVar[bool] = False
@@ -208,6 +211,10 @@ class Robot(ABC):
     def action_size(self) -> int:
         """Components of an action."""
         return len(self.ACTION)
+
+    def substeps(self, dt: float) -> int:
+        """Steps in which `step` computes a control step of dt seconds."""
+        return 1 if self.DISCRETE else substeps_for(dt)
 
     @property
     def kind(self) -> Kind:

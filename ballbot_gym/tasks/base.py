@@ -1,6 +1,7 @@
 """Task: the one definition of an optimal-control problem that env, experts, optimizer and leaderboard use."""
 
 import math
+import zlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -86,6 +87,11 @@ class Task(ABC):
     """Number of uniform numbers that `draw_state` takes."""
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
+    pieces: ClassVar[bool] = False
+    """Whether cost, margins or motion consist of smooth pieces, as with an angle that wraps. Optimizers then take the slopes
+    of the piece that a state is in, and `guesses` or `search_cases` lead to the sequence of pieces that is the best."""
+    counterpart: ClassVar[str] = ""
+    """Id of an environment of another package that is this very problem; see `ballbot_gym.RegretWrapper`."""
     clock: ClassVar[bool] = False
     """Whether cost, goal, margins and observation depend on the episode's time."""
 
@@ -165,6 +171,20 @@ class Task(ABC):
         x = self.start(tuple(rng.random(self.state_draws).tolist()), c, params)
         return np.array(x, np.float64), np.array(c, np.float64)
 
+    def episode_seed(self, index: int) -> tuple[int, ...]:
+        """What seeds the draw of episode `index` of the certified set. A task with a `counterpart` may return (index,): its
+        episodes are then those that both environments draw in `reset(seed=index)`.
+        """
+        return zlib.crc32(self.id.encode()), index
+
+    def counterpart_state(self, env: Any) -> tuple[np.ndarray, np.ndarray]:
+        """State (n,) and constants (nc,) in which the `counterpart`, an unwrapped environment, is.
+
+        Raises:
+            NotImplementedError: the task has no counterpart.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no method `counterpart_state`")
+
     def goal_distance(self, x: Vector, c: Vector) -> Any:
         """About how far a state is from the goal, m, for learners that shape rewards; None where a task defines none."""
         return None
@@ -205,6 +225,18 @@ class Task(ABC):
         target = self.reference(x, c, params)
         share = np.minimum(np.linspace(0, 2, self.steps + 1), 1.0)[:, None]
         return [((1 - share) * x + share * target.x[-1], np.repeat(target.u[-1:], self.steps, axis=0))]
+
+    def search_cases(self, episode: Any) -> list[Any] | None:
+        """What a search of the task's own finds, which replaces that from `guesses`: for motions that are not smooth, case by
+        case.
+
+        Args:
+            episode: the problem, a `ballbot_baselines.solvers.shooting.Shooting`.
+
+        Returns:
+            its `Solution`s, of which the best is taken; None if the task has no search of its own.
+        """
+        return None
 
     def passed_obstacles(self, c: np.ndarray) -> np.ndarray | None:
         """Obstacles passed along x, where `guess_paths` has one path for every choice of sides; None for other tasks.

@@ -26,7 +26,6 @@ from ballbot_gym.robot import (
     Robot,
     checked_randomization,
     sensors,
-    substeps_for,
 )
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import check_observation, limit_names, step
@@ -156,7 +155,7 @@ class BallbotBatch:
         self.state: BatchState | None = None
         self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
         self.restarts = True  # else envs stay at the ends of their episodes
-        self._substeps = substeps_for(self.task.control_dt)
+        self._substeps = self.params.substeps(self.task.control_dt)
         self.randomization.delay_steps(self.task.control_dt)  # raises an error where it is no whole number of these
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._compile = compile

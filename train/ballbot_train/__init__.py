@@ -10,6 +10,7 @@ Everything that users need is imported from here, and each name imports what it 
 | `shipped_policies` | the policies that come with the package |
 | `export_onnx` | a policy file as ONNX |
 | `BallbotVecEnv`, `RslVecEnv` | batched environments for Stable-Baselines3 and rsl-rl |
+| `RegretWrapper` | adds the regret of every episode to its `info` |
 | `RegretCallback` | the regret of an SB3 model while it trains |
 | `Playground` | the simulation behind `ballbot play`, for scripts |
 | `certified_replay` | certified episodes of several controllers in one picture in 3D |
@@ -18,6 +19,7 @@ Everything that users need is imported from here, and each name imports what it 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ballbot_train.evaluation.counterparts import RegretWrapper
     from ballbot_train.evaluation.evaluate import evaluate
     from ballbot_train.evaluation.fresh import evaluate_fresh
     from ballbot_train.learning.callbacks import RegretCallback
@@ -33,6 +35,7 @@ __all__ = [
     "BallbotVecEnv",
     "Playground",
     "RegretCallback",
+    "RegretWrapper",
     "RslVecEnv",
     "certified_replay",
     "evaluate",
@@ -46,6 +49,7 @@ _MODULES = {
     "BallbotVecEnv": "learning.sb3",
     "Playground": "report.simulation",
     "RegretCallback": "learning.callbacks",
+    "RegretWrapper": "evaluation.counterparts",
     "RslVecEnv": "learning.rsl",
     "certified_replay": "report.replay",
     "evaluate": "evaluation.evaluate",

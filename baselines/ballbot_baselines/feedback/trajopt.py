@@ -38,6 +38,11 @@ class TrajoptController:
         return self._tracker.act(t, x)
 
 
+def optimal_trajopt(task: Task, params: Robot) -> TrajoptController:
+    """`TrajoptController` of the optimum itself, without a back-off: what regret is measured against, as a controller."""
+    return TrajoptController(task, params, Backoff())
+
+
 def cautious_trajopt(task: Task, params: Robot) -> TrajoptController:
     """`TrajoptController` for the nominal robot with the least force and friction of the track "unknown".
 

@@ -43,6 +43,9 @@ def attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) ->
         given: ground paths to start from instead of the task's.
     """
     task, x0, c, params = episode.task, episode.x0, episode.c, episode.params
+    if given is None and (cases := task.search_cases(episode)) is not None:
+        yield cases
+        return
     paths = task.guess_paths(x0, c, params) if given is None else given
     if not paths:
         yield _from_states(episode, task.guesses(x0, c, params)[:guesses])

@@ -49,7 +49,8 @@ def check_formulas(task: Task, params: Robot) -> None:
                     f"{task.id}: cost is {values[0, 0]:g} at the start {start}; it must not be negative, because regret "
                     "divides by the optimal cost. Add a constant to it"
                 )
-            for what, one, slope in (("jumps", values, slopes), ("has a kink", slopes, bends)):
+            kinds = [("jumps", values, slopes), ("has a kink", slopes, bends)]
+            for what, one, slope in () if task.pieces else kinds:
                 if _breaks(one, slope):
                     raise ValueError(
                         f"{task.id}: {name} {what} near {start}, and optimizers need slopes that change gradually. Blend "

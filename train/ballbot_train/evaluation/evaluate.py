@@ -15,7 +15,7 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robot import PAPER, Randomization, Robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_parts
-from ballbot_train.evaluation import optima, recordings
+from ballbot_train.evaluation import counterparts, optima, recordings
 from ballbot_train.evaluation.controllers import as_controller, behind, is_file, policy_digest
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.evaluation.runner import checked_episodes, run_episodes, shown_to
@@ -81,7 +81,8 @@ def evaluate(
     Args:
         policy: see `as_controller`: a Stable-Baselines3 model, a function of the observation, a Controller, the name of a
             controller ("lqr", "trajopt", "nmpc") or a policy file.
-        task: a name in `TASKS`, or any Task.
+        task: a name in `TASKS`, or any Task; or the id of a counterpart of a task, such as "Pendulum-v1" where the package
+            `ballbot-classic` is installed: the policy then has the observations and actions of that environment.
         episodes: how many of the certified episodes, from the first.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
@@ -110,6 +111,8 @@ def evaluate(
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = range(checked_episodes(episodes))
+        if counterpart := counterparts.counterpart_of(task):
+            policy = counterparts.translated(policy, counterpart, env.task, env.params)
         controller = as_controller(policy, env.task, env.params, filter)
         env = shown_to(controller, env)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)

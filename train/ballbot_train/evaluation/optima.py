@@ -10,10 +10,10 @@ from typing import Any
 
 from ballbot_gym import certified
 from ballbot_gym.certified import cache
-from ballbot_gym.env import make_task
+from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.registry import name_of
-from ballbot_gym.robot import PAPER, Randomization, Robot, checked_robot, file_name, robot_name
+from ballbot_gym.robot import PAPER, Randomization, Robot, file_name, robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.checks import check_methods, check_paths
@@ -48,7 +48,7 @@ def known(
         PlanError: an episode has no optimum that can be found.
         ValueError: no task or robot of that name, or no optimum is known under such a randomization.
     """
-    task, params = make_task(task, robot), checked_robot(robot)
+    task, params = make_task(task, robot), robot_of(task, robot)
     if not randomization.moves_optima:
         randomization = Randomization()
     needed = range(certified.EPISODES) if episodes is None else list(episodes)

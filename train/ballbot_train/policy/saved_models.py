@@ -55,15 +55,18 @@ class _Saved(NamedTuple):
 class _SavedActor(torch.nn.Module):
     """Runs a network, and brings its output into [−1, 1]."""
 
-    def __init__(self, network: torch.nn.Module, squashed: bool, history: int = 0):
-        """Args: squashed: whether the output is, by tanh; else it is clipped. history: as that of its env."""
+    def __init__(self, network: torch.nn.Module, squashed: bool, history: int = 0, unit: Any = 1.0):
+        """Args: squashed: whether the output is, by tanh; else it is clipped. history: as that of its env. unit: the largest
+        action of its env.
+        """
         super().__init__()
         self.history = history
+        self.register_buffer("unit", torch.as_tensor(unit, dtype=torch.float32))
         self.network, self._squashed = network, squashed
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         action = self.network(observation)
-        return torch.tanh(action) if self._squashed else action.clamp(-1.0, 1.0)
+        return torch.tanh(action) if self._squashed else (action / self.unit).clamp(-1.0, 1.0)
 
 
 def mark(space: spaces.Space, task: Task, params: Robot) -> None:
@@ -74,15 +77,18 @@ def mark(space: spaces.Space, task: Task, params: Robot) -> None:
     setattr(space, _MARK, observation_digest(task, params))
 
 
-def check_spaces(name: str, model: Any, task: Task, params: Robot) -> None:
+def check_spaces(
+    name: str, model: Any, task: Task, params: Robot, counterpart: tuple[spaces.Box, spaces.Box] | None = None
+) -> None:
     """Refuses a model that was trained in other spaces, as behind a wrapper that rescales, stacks or converts.
 
-    Its `observation_space` and `action_space` are compared with the env's, if it has them, and so is its `mark`.
+    Its `observation_space` and `action_space` are compared with the env's, if it has them, and so is its `mark`. The spaces
+    of a `counterpart` of the task may be given instead of the env's.
 
     Raises:
         PolicyError: they differ; the message says what to evaluate instead.
     """
-    history = history_of(model, task, params)
+    history = 0 if counterpart else history_of(model, task, params)
     if (
         getattr(getattr(model, "observation_space", None), _MARK, observed := observation_digest(task, params))
         != observed
@@ -92,7 +98,8 @@ def check_spaces(name: str, model: Any, task: Task, params: Robot) -> None:
             "`observe`, or train again"
         )
     seen = observation_space(task, params, history)
-    own = {"observation": seen, "action": spaces.Box(-1.0, 1.0, (params.action_size,), np.float32)}
+    acting = spaces.Box(-1.0, 1.0, (params.action_size,), np.float32)
+    own = dict(zip(("observation", "action"), counterpart or (seen, acting), strict=True))
     for kind, wanted in own.items():
         found = getattr(model, f"{kind}_space", None)
         if found is not None and not _alike(found, wanted):
@@ -148,28 +155,37 @@ def fits(path: str | Path, task: Task, params: Robot) -> bool:
     return True
 
 
-def load_actor(path: str | Path, task: Task, params: Robot) -> _SavedActor:
+def load_actor(
+    path: str | Path, task: Task, params: Robot, counterpart: tuple[spaces.Box, spaces.Box] | None = None
+) -> _SavedActor:
     """The deterministic policy of a saved model: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
 
     Args:
         path: of the file.
         task: what it is to do.
         params: the robot.
+        counterpart: spaces of observations and actions of the environment in which it was trained, if that is a counterpart
+            of the task.
 
     Raises:
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
     model = read(path)
-    size = _size(model, task, params)
-    if model.observations != size:
-        raise PolicyError(f"{path} takes {model.observations} observations, {task.id} has {size}")
-    check_spaces(str(path), model, task, params)
+    size = counterpart[0].shape[0] if counterpart else _size(model, task, params)
+    actions = len(model.layers[-1][1])
+    if (model.observations, actions) != (size, params.action_size):
+        raise PolicyError(
+            f"{path} takes {model.observations} observations and gives {actions} actions; {task.id} has {size} and "
+            f"{params.action_size}"
+        )
+    check_spaces(str(path), model, task, params, counterpart)
     widths = (size, *(len(bias) for _, bias in model.layers))
     network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
     for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-    return _SavedActor(network, model.squashed, history_of(model, task, params)).eval()
+    history = 0 if counterpart else history_of(model, task, params)
+    return _SavedActor(network, model.squashed, history, counterpart[1].high if counterpart else 1.0).eval()
 
 
 def _size(model: _Saved, task: Task, params: Robot) -> int:
@@ -239,7 +255,7 @@ def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]
     """Weight and bias of the linear layers under names that begin so, in order.
 
     Raises:
-        PolicyError: they are not what `checked` takes, do not follow one another, or do not end in two actions.
+        PolicyError: they are not what `checked` takes, or do not follow one another.
     """
     names = []
     for prefix in prefixes:
@@ -253,8 +269,8 @@ def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]
     fitting = all(weight.ndim == 2 and bias.shape == weight.shape[:1] for weight, bias in layers) and all(
         after.shape[1] == before.shape[0] for (before, _), (after, _) in itertools.pairwise(layers)
     )
-    if not fitting or shapes[-1:] != [(2,)]:
+    if not fitting or not shapes:
         raise PolicyError(
-            f"{path} is no network of linear layers that ends in 2 actions: its weights and biases are {shapes!s:.200}"
+            f"{path} is no network of linear layers that ends in actions: its weights and biases are {shapes!s:.200}"
         )
     return layers

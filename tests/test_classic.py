@@ -1,0 +1,173 @@
+"""Gymnasium's classic systems as robots and tasks from outside of the packages, with their optima."""
+
+import math
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import ballbot_baselines
+import ballbot_gym
+import ballbot_train
+from ballbot_baselines import find_optimum
+from ballbot_gym import TASKS, BallbotEnv, named_robot
+from ballbot_gym.env import make_task, robot_of
+from ballbot_gym.robot import ROBOTS
+from ballbot_train import RegretWrapper, evaluate
+
+FOLDER = Path(__file__).parent.parent / "examples" / "classic" / "src"
+COUNTERPARTS = ("pendulum",)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def classic():
+    """The tasks and robots of the example, which are gone after these tests."""
+    before, robots, known = dict(TASKS), dict(ROBOTS), dict(gymnasium.registry)
+    sys.path.insert(0, str(FOLDER))
+    try:
+        import ballbot_classic
+
+        ballbot_classic.register()
+        yield ballbot_classic
+    finally:
+        sys.path.remove(str(FOLDER))
+        for held, own in ((TASKS, before), (ROBOTS, robots), (gymnasium.registry, known)):
+            held.clear()
+            held.update(own)
+        for name in [name for name in sys.modules if name.partition(".")[0] == "ballbot_classic"]:
+            del sys.modules[name]
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """A folder of optima that only this test uses."""
+    folder = tmp_path / "optima"
+    folder.mkdir(mode=0o700)
+    monkeypatch.setenv("BALLBOT_OPTIMA", str(folder))
+    return folder
+
+
+def optimum_of_seed(name, seed):
+    """The optimum of the episode that the environment draws from a seed."""
+    task, robot = make_task(name), robot_of(name)
+    x, c = task.sample(np.random.default_rng(seed), robot)
+    return find_optimum(task, robot, x, c)
+
+
+@pytest.mark.parametrize("name", COUNTERPARTS)
+def test_it_moves_and_pays_as_gymnasiums_own(name):
+    task, rng = make_task(name), np.random.default_rng(0)
+    with BallbotEnv(name) as env, gymnasium.make(task.counterpart) as other:
+        high = other.action_space.high
+        for seed in range(3):
+            seen, _info = env.reset(seed=seed)
+            expected, _ = other.reset(seed=seed)
+            np.testing.assert_array_equal(seen, expected)
+            ended = False
+            while not ended:
+                action = rng.uniform(-1, 1, 1).astype(np.float32)
+                seen, reward, *ends, _ = env.step(action)
+                expected, paid, *expected_ends, _ = other.step(action * high)
+                np.testing.assert_allclose(seen, expected, atol=1e-4)  # it computes in part with float32
+                assert reward == pytest.approx(paid, abs=1e-4)
+                assert ends == expected_ends
+                ended = any(ends)
+
+
+@pytest.mark.parametrize("name", COUNTERPARTS)
+def test_the_certified_episodes_are_gymnasiums_resets_by_seed(name):
+    from ballbot_gym.certified import cache
+
+    task, robot = make_task(name), robot_of(name)
+    with gymnasium.make(task.counterpart) as env:
+        for seed in (0, 1, 199):
+            env.reset(seed=seed)
+            np.testing.assert_array_equal(task.counterpart_state(env.unwrapped)[0], cache.episode(task, robot, seed)[0])
+
+
+@pytest.mark.parametrize(("name", "seed"), [("pendulum", 1), ("pendulum", 2), ("pendulum", 8)])
+def test_the_optimums_actions_earn_its_return_in_gymnasiums_own(name, seed):
+    from ballbot_classic.replay import followed, returned
+
+    optimum, task = optimum_of_seed(name, seed), make_task(name)
+    assert optimum.is_optimal
+    earned, *_ = returned(task.counterpart, followed(name, optimum, seed), seed)
+    assert earned == pytest.approx(task.survival_pay - optimum.cost, abs=1e-5)
+
+
+def test_the_angle_may_wrap_and_the_rate_be_clipped_along_the_optimum():
+    hanging, fast = optimum_of_seed("pendulum", 2).trajectory.x, optimum_of_seed("pendulum", 8).trajectory.x
+    assert abs(hanging[-1, 0]) == pytest.approx(2 * math.pi)
+    assert np.abs(fast[:, 1]).max() == pytest.approx(8.0, abs=1e-4)
+
+
+def test_swings_of_either_side_and_number_are_compared(classic):
+    from ballbot_baselines.solvers.shooting import Backoff, Shooting
+
+    task, robot = make_task("pendulum"), named_robot("pendulum")
+    x, c = task.sample(np.random.default_rng(3), robot)
+    found = sorted(each.cost for each in task.search_cases(Shooting(task, robot, x, c, Backoff())) if each.is_optimal)
+    assert found[-1] > 1.01 * found[0]
+    assert optimum_of_seed("pendulum", 3).cost == pytest.approx(found[0], rel=1e-9)
+
+
+def test_controllers_reach_the_optimum_of_the_pendulum_and_lqr_does_not(own_cache):
+    rows = {name: evaluate(name, "Pendulum-v1", episodes=3) for name in ("optimum", "nmpc", "lqr")}
+    assert abs(rows["optimum"].regret_mean) < 1e-9
+    assert rows["nmpc"].regret_mean < 0.01
+    assert rows["lqr"].regret_mean > 1
+
+
+def test_a_function_acts_in_the_units_of_the_counterpart(own_cache):
+    seen = []
+
+    def push(observation):
+        seen.append(observation)
+        return np.array([2.0])
+
+    evaluate(push, "Pendulum-v1", episodes=1)
+    with BallbotEnv("pendulum"), gymnasium.make("Pendulum-v1") as other:
+        expected, _ = other.reset(seed=0)
+        np.testing.assert_array_equal(seen[0], expected)
+        cost = sum(-other.step(np.array([2.0], np.float32))[1] for _ in range(200))
+        row = evaluate(push, "pendulum", episodes=1)  # an action of 2 is clipped to 1, which is as much
+    assert row.regret_mean == pytest.approx(cost / optimum_of_seed("pendulum", 0).cost - 1, rel=1e-5)
+
+
+def test_the_wrapper_reports_the_regret_of_every_episode(own_cache):
+    env = RegretWrapper(gymnasium.make("Pendulum-v1"))
+    for seed in (0, 10_001):
+        env.reset(seed=seed)
+        total, ended = 0.0, False
+        while not ended:
+            _, reward, _terminated, ended, info = env.step(np.zeros(1, np.float32))
+            total += reward
+            assert ended == ("regret" in info)
+        best = optimum_of_seed("pendulum", seed).cost
+        assert info["optimum"] == pytest.approx(-best)
+        assert info["gap"] == pytest.approx(-best - total)
+        assert info["regret"] == pytest.approx(-total / best - 1)
+    assert len(list(own_cache.rglob("starts/*.json"))) == 2
+
+
+def test_the_wrapper_takes_own_environments_and_many_at_once(own_cache):
+    env = RegretWrapper(gymnasium.make("ClassicPendulum-v0"))
+    env.reset(seed=1)
+    for _ in range(200):
+        *_, info = env.step(np.zeros(1, np.float32))
+    many = gymnasium.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync", wrappers=[RegretWrapper])
+    many.reset(seed=1)
+    for _ in range(200):
+        *_, infos = many.step(np.zeros((2, 1), np.float32))
+    assert infos["regret"][0] == pytest.approx(info["regret"], rel=1e-5)
+    with pytest.raises(ValueError, match="unknown task 'Acrobot-v1'"):
+        RegretWrapper(gymnasium.make("Acrobot-v1"))
+
+
+def test_the_packages_do_not_name_them():
+    folders = [Path(package.__file__).parent for package in (ballbot_gym, ballbot_baselines, ballbot_train)]
+    words = ("mountain", "acrobot", "angle_normalize")
+    for path in (path for folder in folders for path in folder.rglob("*.py")):
+        assert not [word for word in words if word in path.read_text().lower()], path
