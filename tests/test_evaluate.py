@@ -18,11 +18,9 @@ from rich.console import Console
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import controllers, evaluate, runner
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.controllers import make_controller, portable
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.policy.files import PolicySpec, shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, save_policy
@@ -137,15 +135,15 @@ def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
 def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
     path = str(save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {}))
     chosen = controllers.controllers_of(["stabilize", "turn"], ["lqr", path])
-    assert chosen == {"stabilize": ["lqr"], "turn": ["lqr", path]}
-    assert controllers.controllers_of(["stabilize", "turn"], [path]) == {"turn": [path]}
+    assert chosen == {"paper": {"stabilize": ["lqr"], "turn": ["lqr", path]}}
+    assert controllers.controllers_of(["stabilize", "turn"], [path]) == {"paper": {"turn": [path]}}
     assert set(controllers.policy_digests(chosen)) == {f"turn/{path}"}
     with pytest.raises(ValueError, match="which is none of stabilize"):
         controllers.controllers_of(["stabilize"], [path])
 
 
 def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
-    for task, names in controllers.controllers_of(list(TASKS)).items():
+    for task, names in controllers.controllers_of(list(TASKS))["paper"].items():
         assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
@@ -167,21 +165,21 @@ def test_an_import_loads_only_what_it_needs():
     assert run.stdout.splitlines() == [str(loaded) for _, loaded in IMPORTS]
 
 
-def test_a_worker_needs_no_file_of_a_policy(tmp_path):
-    source = shipped_policies(make_task("turn"))["dagger"]
+def test_a_worker_needs_no_file_of_a_policy(tmp_path, monkeypatch):
+    source, folder = shipped_policies(make_task("turn"))["dagger"], tmp_path / "policies"
+    folder.mkdir()
     for ending in (".json", ".safetensors"):
-        shutil.copy(source.with_suffix(ending), tmp_path / f"mine{ending}")
-    path, task, params = str(tmp_path / "mine.json"), make_task("turn"), default_params()
-    expected = make_controller(path, task, params)
-    sent = pickle.dumps(portable(path, task, params))
-    for each in tmp_path.iterdir():
-        each.unlink()
-    controller = pickle.loads(sent)
-    x, c = np.zeros(8), np.array([3.0])
-    for made in (expected, controller):
-        made.reset(0.0, x, c)
-    assert np.array_equal(controller.act(0.0, x), expected.act(0.0, x))
-    assert [portable(name, task, params) for name in ("lqr", "dagger")] == ["lqr", "dagger"]
+        shutil.copy(source.with_suffix(ending), folder / f"mine{ending}")
+
+    def run_elsewhere(jobs, *_):
+        sent = pickle.dumps(jobs)
+        shutil.rmtree(folder)
+        return [list(job.function(*job.arguments, job.items)) for job in pickle.loads(sent)]
+
+    monkeypatch.setattr(runner.jobs, "run", run_elsewhere)
+    groups = [runner.Group("turn", name, "rk4") for name in (str(folder / "mine.json"), "dagger")]
+    own, shipped = runner.run_groups(groups, 1, tmp_path, 1)
+    assert own.cost == shipped.cost
 
 
 def test_whatever_is_evaluated_can_be_compared(tmp_path):

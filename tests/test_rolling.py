@@ -32,7 +32,7 @@ from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
-from ballbot_train.evaluation.controllers import controllers_by_robot
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.policy.files import PolicyError, PolicySpec, shipped_policies
 from ballbot_train.policy.network import load_network, load_policy
 
@@ -359,13 +359,13 @@ def test_an_engine_that_is_not_installed_is_noticed_before_any_episode(tmp_path,
 
 
 def test_transfer_runs_a_name_for_the_robots_that_have_it():
-    chosen = controllers_by_robot(["turn"], ["dagger", "lqr"], ["paper", "rolling"])
+    chosen = controllers_of(["turn"], ["dagger", "lqr"], ["paper", "rolling"])
     assert chosen["paper"] == {"turn": ["dagger", "lqr"]}
     assert "lqr" in chosen["rolling"]["turn"]
     with pytest.raises(ValueError, match="unknown controller nobody"):
-        controllers_by_robot(["turn"], ["lqr", "nobody"], ["paper", "rolling"])
+        controllers_of(["turn"], ["lqr", "nobody"], ["paper", "rolling"])
     with pytest.raises(ValueError, match="given more than once"):
-        controllers_by_robot(["turn"], ["lqr", "lqr"], ["paper"])
+        controllers_of(["turn"], ["lqr", "lqr"], ["paper"])
 
 
 def test_a_policy_is_of_one_robot(rolling):

@@ -89,7 +89,7 @@ def test_a_saved_model_with_statistics_of_vecnormalize_is_refused(normalized):
 def test_a_saved_model_is_evaluated_by_its_path(tmp_path):
     path = tmp_path / "model.zip"
     MODELS["ppo"]().save(path)
-    assert controllers_of(["turn", "stabilize"], [str(path)]) == {"stabilize": [str(path)]}
+    assert controllers_of(["turn", "stabilize"], [str(path)]) == {"paper": {"stabilize": [str(path)]}}
     assert evaluate(path, "stabilize", 1, "rk4").episodes == 1
     assert len(evaluate_fresh(path, "stabilize", 3)) == 3
     with pytest.raises(ValueError, match="was made for a task with 8 observations, which is none of turn"):

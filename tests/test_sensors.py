@@ -140,7 +140,7 @@ def test_evaluation_shows_sensors_to_a_filtered_controller():
     rows = [evaluate(name, "stabilize", episodes=2, physics="rk4", robot="omni_strong") for name in ("lqr", "lqr-ekf")]
     assert [row.success for row in rows] == [1, 1]
     assert 0 < rows[1].regret_mean - rows[0].regret_mean < 0.1
-    assert controllers_of(["stabilize"], ["lqr-ekf"], "omni") == {"stabilize": ["lqr-ekf"]}
+    assert controllers_of(["stabilize"], ["lqr-ekf"], ["omni"]) == {"omni": {"stabilize": ["lqr-ekf"]}}
 
 
 def test_the_wrapper_shows_a_policy_the_state():

@@ -120,7 +120,7 @@ def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, tr
     alone, behind = (evaluate(name, task, 6, "rk4", randomization=track) for name in (policy, filtered))
     assert alone.success < behind.success
     assert behind.success > 0.9
-    assert controllers_of([task], [filtered]) == {task: [filtered]}
+    assert controllers_of([task], [filtered]) == {"paper": {task: [filtered]}}
 
 
 def test_a_batch_of_filters_does_what_one_does():

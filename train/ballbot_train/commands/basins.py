@@ -5,7 +5,7 @@ from pathlib import Path
 from ballbot_gym.robot import PAPER
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import basins as maps
-from ballbot_train.evaluation.controllers import all_behind, controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.names import ways_on, with_way
 from ballbot_train.evaluation.runner import open_run
 from ballbot_train.report import figures
@@ -36,10 +36,10 @@ def basins(
     """
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
-    chosen = controllers_of([maps.TASK], all_behind(controllers, filter), robot)
+    chosen = controllers_of([maps.TASK], controllers, [robot], filter)
     physics = physics_or_default(physics, robot)
-    names = chosen[maps.TASK]
-    facts = open_run(out, workers, {robot: chosen}, robot, physics=physics, points=points)
+    names = chosen[robot][maps.TASK]
+    facts = open_run(out, workers, chosen, robot, physics=physics, points=points)
     ways = facts.get("trained_by", {})
     made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)

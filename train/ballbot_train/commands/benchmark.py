@@ -8,7 +8,7 @@ from ballbot_gym.robot import PAPER, Ballbot, checked_randomization, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness
-from ballbot_train.evaluation.controllers import all_behind, controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import (
     HEADER,
     TABLE,
@@ -54,14 +54,15 @@ def benchmark(
             the experts that are made for each track run.
         filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
-    chosen = controllers_of(tasks, all_behind(controllers, filter), robot, tracks=bool(randomization))
+    made_for = controllers_of(tasks, controllers, [robot], filter, tracks=bool(randomization))
+    chosen = made_for[robot]
     physics = physics_or_default(physics, robot)
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:
         for track in randomization:
             checked_randomization(track)
         settings["tracks"] = list(randomization)
-    facts = open_run(out, workers, {robot: chosen}, robot, **settings)
+    facts = open_run(out, workers, made_for, robot, **settings)
     if randomization:
         experts = {} if controllers else robustness.EXPERTS
         groups = robustness.groups_of(chosen, randomization, physics, robot, experts)

@@ -14,7 +14,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.evaluation import optima
 from ballbot_train.work import jobs
-from ballbot_train.work.console import RobotName, check_least, check_some, console
+from ballbot_train.work.console import RobotName, check_least, check_names, console
 from ballbot_train.work.executors import Workers
 from ballbot_train.work.provenance import provenance
 
@@ -45,7 +45,7 @@ def certify(
         robot: name of the robot.
         randomization: name of the track that each episode's robot and delay are drawn from; default, none.
     """
-    check_some("task", tasks, TASKS)
+    check_names("task", tasks, TASKS, least=1)
     check_least(1, episodes=episodes)
     if shards is None and episodes > _MOST_EPISODES:
         raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}; or give --shards")

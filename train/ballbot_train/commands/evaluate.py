@@ -72,7 +72,7 @@ def evaluate(
     """
     varied = checked_randomization(randomization)
     task, policy = task_name(policy, task, robot), behind(policy, filter)
-    chosen = controllers_of([task], [policy], robot)
+    chosen = controllers_of([task], [policy], [robot])
     check_least(0, optima=optima or 0)
     named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
@@ -88,7 +88,7 @@ def evaluate(
     engine, count = physics_or_default(physics, robot), checked_episodes(episodes)
     settings = {"physics": engine, "episodes": count, "seed": seed}
     settings |= {"tracks": [randomization]} if randomization else {}
-    facts = open_run(out, workers, {robot: chosen}, robot, **settings)
+    facts = open_run(out, workers, chosen, robot, **settings)
     group = Group(task, policy, engine, robot, randomization=varied, own_optima=True)
     results = run_groups([group], count, out, workers, seed, record=not varied.active)
     rows = leaderboard(results, seed)
@@ -123,7 +123,7 @@ def _evaluate_fresh(
         jobs.check_same(held, of, out, "results")
     facts = provenance() | {
         **of,
-        "policies": policy_digests({task: [policy]}, robot),
+        "policies": policy_digests({robot: {task: [policy]}}, robot),
         "seed": seed,
         "episodes": count,
         "physics": "closed form, batched, float64",

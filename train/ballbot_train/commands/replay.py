@@ -7,7 +7,7 @@ from ballbot_gym.engines import default_physics
 from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter
-from ballbot_train.evaluation.controllers import all_behind
+from ballbot_train.evaluation.controllers import behind
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
 from ballbot_train.report.replay import certified_replay, file_replay
@@ -68,7 +68,7 @@ def replay(
         _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
         check_names("task", source, TASKS)
         _check(bool(controllers), "give at least one controller")
-        controllers = tuple(all_behind(controllers, filter))
+        controllers = tuple(behind(name, filter) for name in controllers)
         shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)
         made = file_name(source[0], robot)
         # parts of names hold no plus, so that no other controllers or floors make the same name

@@ -7,11 +7,11 @@ from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness as stressed
-from ballbot_train.evaluation.controllers import all_behind, controllers_of
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
 from ballbot_train.evaluation.runner import checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
-from ballbot_train.work.console import Physics, RobotName, check_some, console, physics_or_default
+from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
 from ballbot_train.work.executors import Workers
 
 
@@ -41,11 +41,11 @@ def robustness(
         robot: whose episodes and controllers.
         filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
-    chosen = controllers_of(tasks, all_behind(controllers, filter), robot)
+    chosen = controllers_of(tasks, controllers, [robot], filter)[robot]
     if not controllers:
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
     physics = physics_or_default(physics, robot)
-    check_some("stress", stresses, stressed.STRESSES)
+    check_names("stress", stresses, stressed.STRESSES, least=1)
     settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     facts = open_run(out, workers, {robot: chosen}, robot, **settings)
     results = run_groups(stressed.groups_of(chosen, stresses, physics, robot), episodes, out, workers, seed)

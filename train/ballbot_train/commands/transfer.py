@@ -10,10 +10,10 @@ from pathlib import Path
 from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
-from ballbot_train.evaluation.controllers import all_behind, controllers_by_robot
+from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
 from ballbot_train.evaluation.runner import Group, checked_episodes, floor, open_run, publish, run_groups
-from ballbot_train.work.console import Physics, RobotName, check_some, console, physics_or_default
+from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
 from ballbot_train.work.executors import Workers
 
 _REGRET = "regret over the optimum on the robot's own floor"
@@ -63,10 +63,10 @@ def transfer(
         workers: who does the work.
         filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
     """
-    check_some("robot", made_for, ROBOTS)
+    check_names("robot", made_for, ROBOTS, least=1)
     for friction in frictions:
         floor(robot, friction)
-    chosen = controllers_by_robot(tasks, all_behind(controllers, filter), made_for)
+    chosen = controllers_of(tasks, controllers, made_for, filter)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
     engines, episodes = [physics_or_default(one, robot) for one in physics or (None,)], checked_episodes(episodes)

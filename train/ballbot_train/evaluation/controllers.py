@@ -17,9 +17,8 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, ROBOTS, Robot, named_robot, robot_name
 from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train.policy import files as policy_files
 from ballbot_train.policy.files import PolicyError, is_run, read_description, shipped_policies, weights_digest
-from ballbot_train.work.console import check_names, check_some
+from ballbot_train.work.console import check_names
 
 _SENSORS = "ekf"
 """The filter for robots with wheels: it makes the state from sensors."""
@@ -59,18 +58,7 @@ def behind(name: str, filter: str | None) -> str:
     return f"{name}-{filter}" if filter else name
 
 
-def all_behind(given: Sequence[str], filter: str | None) -> list[str]:
-    """As `behind`, of every controller that is named.
-
-    Raises:
-        ValueError: none is.
-    """
-    if filter and not given:
-        raise ValueError("a filter needs controllers that it stands in front of; give --controllers with --filter")
-    return [behind(name, filter) for name in given]
-
-
-def of_other_robot(name: str, task: Task) -> str:
+def _of_other_robot(name: str, task: Task) -> str:
     """What to type for a policy of a task that comes with the package for other robots; "" of another name."""
     robots = [robot for robot in ROBOTS if name in shipped_policies(task, robot, None)]
     if not robots:
@@ -122,7 +110,7 @@ def _is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
     return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
 
-def made_for(name: str) -> str:
+def _made_for(name: str) -> str:
     """What the policy of a file was made for, in words.
 
     Raises:
@@ -137,18 +125,17 @@ def made_for(name: str) -> str:
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
 
+def _file_of(name: str, task: Task, robot: str = PAPER) -> str | Path:
+    """The file of a policy that comes with the package, or that is named by its path, perhaps with a filter."""
+    alone, _ = split(name)
+    return shipped_policies(task, robot, None).get(alone, alone)
+
+
 def policy_digest(name: str, task: Task, robot: str | Robot = PAPER) -> str:
     """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
     if is_expert(name):
         return ""
-    robot, name = robot if isinstance(robot, str) else robot_name(robot), split(name)[0]
-    return weights_digest(shipped_policies(task, robot, None).get(name, name))
-
-
-def network_digest(name: str, task: Task, robot: str = PAPER) -> str:
-    """Digest of the network of a policy by name or file, as its description says; see `policy.files.network_digest`."""
-    name = split(name)[0]
-    return policy_files.network_digest(shipped_policies(task, robot, None).get(name, name))
+    return weights_digest(_file_of(name, task, robot if isinstance(robot, str) else robot_name(robot)))
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
@@ -166,7 +153,7 @@ def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
     named = next((name for name in TASKS if _is_made_for(policy, make_task(name, robot), robot)), None)
     if named is None:
         raise ValueError(
-            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields for the "
+            f"{policy} was made for {_made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields for the "
             f"robot {robot}; give --task, or another --robot"
         )
     return named
@@ -190,14 +177,6 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
             f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
         )
     return Path(name)
-
-
-def portable(name: str, task: Task, params: Robot) -> str | Controller:
-    """The controller of a file, to be sent to workers that do not have the file. Other names stay names.
-
-    Raises: as `make_controller`.
-    """
-    return make_controller(name, task, params) if is_file(name) else name
 
 
 def make_controller(name: str, task: Task, params: Robot) -> Controller:
@@ -241,7 +220,7 @@ def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
     shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):
         known = f"{task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
-        raise ValueError(f"unknown controller {name!r}; {of_other_robot(name, task) or known}")
+        raise ValueError(f"unknown controller {name!r}; {_of_other_robot(name, task) or known}")
     if _is_saved_model(name):
         from ballbot_train.policy.network import PolicyController  # it imports torch
         from ballbot_train.policy.saved_models import load_actor
@@ -354,26 +333,32 @@ def _keywords(function: Any) -> set[str] | None:
 
 
 def controllers_of(
-    tasks: Sequence[str], given: Sequence[str] = (), robot: str = PAPER, tracks: bool = False
-) -> dict[str, list[str]]:
-    """The controllers to run on each task: those named that the task has; without any, all it has but for variants.
+    tasks: Sequence[str],
+    given: Sequence[str] = (),
+    robots: Sequence[str] = (PAPER,),
+    filter: str | None = None,
+    tracks: bool = False,
+) -> dict[str, dict[str, list[str]]]:
+    """The controllers to run, by the robot that they were made for and by task.
 
-    Policies that were trained on tracks are among the latter if tracks are run.
+    A policy is made for one task and one robot, and is left out for the others. So are tasks without a controller.
 
-    A policy is made for one task, and is left out for the others; tasks left without a controller are left out too.
+    Args:
+        tasks: names of tasks.
+        given: names of controllers; default, all that tasks and robots have, but for variants.
+        robots: by name.
+        filter: in front of each of those given, see `behind`.
+        tracks: whether policies that were trained on tracks are among the default.
 
     Raises:
-        ValueError: a name that none of the tasks has, a name that is given twice, or no task.
+        ValueError: a name that no task has for any of the robots, a name that is given twice, a filter without names, or no
+            task.
         PolicyError: a policy file that is missing or damaged.
     """
-    return controllers_by_robot(tasks, given, [robot], tracks)[robot]
-
-
-def controllers_by_robot(
-    tasks: Sequence[str], given: Sequence[str], robots: Sequence[str], tracks: bool = False
-) -> dict[str, dict[str, list[str]]]:
-    """As `controllers_of`, by the robots that controllers were made for. A name is of the robots that have it."""
-    check_some("task", tasks, TASKS)
+    check_names("task", tasks, TASKS, least=1)
+    if filter and not given:
+        raise ValueError("a filter needs controllers that it stands in front of; give --controllers with --filter")
+    given = [behind(name, filter) for name in given]
     track = None if tracks or given else ""
     known = {robot: {task: names(make_task(task, robot), robot, track) for task in tasks} for robot in robots}
     if not given:
@@ -387,26 +372,35 @@ def controllers_by_robot(
     used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
     unused = [name for name in given if name not in used]
     if unused and is_file(unused[0]):
-        raise ValueError(f"{unused[0]} was made for {made_for(unused[0])}, which is none of {', '.join(tasks)}")
+        raise ValueError(f"{unused[0]} was made for {_made_for(unused[0])}, which is none of {', '.join(tasks)}")
     for task in tasks if unused else ():
-        if hint := of_other_robot(unused[0], make_task(task, robots[0])):
+        if hint := _of_other_robot(unused[0], make_task(task, robots[0])):
             raise ValueError(f"unknown controller {unused[0]} for the robot {robots[0]}; {hint}")
     check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
     return chosen
 
 
-def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
-    """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
-    return digests_of_policies(controllers, robot, policy_digest)
-
-
-def digests_of_policies(
-    controllers: Mapping[str, Sequence[str]], robot: str, digest: Callable[[str, Task, str], str]
+def policy_digests(
+    controllers: Mapping[str, Mapping[str, Sequence[str]]],
+    robot: str = PAPER,
+    of: Callable[[str | Path], str] = weights_digest,
 ) -> dict[str, str]:
-    """A digest of every learned policy among controllers by task, under "TASK/NAME"."""
+    """A digest of every learned policy among controllers by robot and task.
+
+    Args:
+        controllers: as `controllers_of` gives them.
+        robot: on which they run, by name.
+        of: what the digest is of, from a policy's file.
+
+    Returns:
+        The digests under "TASK/NAME", or "ROBOT/TASK/NAME" of policies that were made for another robot.
+    """
     return {
-        f"{task}/{name}": digest(name, make_task(task, robot), robot)
-        for task, group in controllers.items()
+        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(
+            _file_of(name, make_task(task, made_for), made_for)
+        )
+        for made_for, by_task in controllers.items()
+        for task, group in by_task.items()
         for name in group
         if not is_expert(name)
     }

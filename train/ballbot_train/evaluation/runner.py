@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.results import Result, columns, table_cells
-from ballbot_train.policy.files import shipped_ways
+from ballbot_train.policy.files import network_digest, shipped_ways, weights_digest
 from ballbot_train.work import jobs
 from ballbot_train.work.console import check_least, markdown, print_table
 from ballbot_train.work.executors import Workers
@@ -50,7 +50,7 @@ def open_run(
     Args:
         out: the folder.
         workers: a number of processes, or `Workers`; they change no result.
-        chosen: the controllers that are run by task, by the robot that they were made for, as `controllers_by_robot` gives.
+        chosen: the controllers that are run by task, by the robot that they were made for, as `controllers_of` gives.
         robot: on which they run, by name.
         settings: whatever else decides the results.
 
@@ -62,14 +62,7 @@ def open_run(
             process is using it; or the seed is negative.
     """
     check_least(0, seed=settings.get("seed", 0))
-    policies, networks = (
-        {
-            name if made_for == robot else f"{made_for}/{name}": found
-            for made_for, by_task in chosen.items()
-            for name, found in registry.digests_of_policies(by_task, made_for, digest).items()
-        }
-        for digest in (registry.policy_digest, registry.network_digest)
-    )
+    policies, networks = (registry.policy_digests(chosen, robot, of) for of in (weights_digest, network_digest))
     problems = {
         task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
         for made_for, by_task in chosen.items()
@@ -214,7 +207,9 @@ def _jobs_of(
 ) -> Iterator[jobs.Job]:
     """The jobs of a group, of `CHUNK` episodes each."""
     chosen = known[group.problem] if group.starts is None else _without_optima(group.starts)
-    sent = registry.portable(group.controller, *group.believed)
+    # workers need not have a policy's file, so what it holds goes along
+    is_file = registry.is_file(group.controller)
+    sent = registry.make_controller(group.controller, *group.believed) if is_file else group.controller
     words = "-".join(map(str, (group.task, group.controller, group.physics, *group.labels.values())))
     count = episodes if group.starts is None else len(group.starts)
     group = replace(group, starts=None)  # they are in the set

@@ -45,10 +45,9 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.identity import digest
 from ballbot_train.evaluation import controllers
 from ballbot_train.learning.datasets import IN_DATASET, metadata_of
-from ballbot_train.policy.files import OBSERVATION_VERSION
+from ballbot_train.policy.files import OBSERVATION_VERSION, content_digest, shipped_policies
 from ballbot_train.work import jobs, shards
 from ballbot_train.work.console import check_names
 from ballbot_train.work.executors import Workers
@@ -201,16 +200,11 @@ def record(
 
 def _content(config: DemoConfig) -> dict[str, Any]:
     """What decides a dataset behind the names that its settings give."""
-    task, content = (
-        make_task(config.task, config.robot),
-        {"problem": certified.named_problem(config.task, config.robot)},
-    )
+    content = {"problem": certified.named_problem(config.task, config.robot)}
     if controllers.is_expert(config.expert):
         return content
-    weights, network = (
-        of(config.expert, task, config.robot) for of in (controllers.policy_digest, controllers.network_digest)
-    )
-    return content | {"expert_policy": digest(weights, network)}
+    shipped = shipped_policies(make_task(config.task, config.robot), config.robot)
+    return content | {"expert_policy": content_digest(shipped[config.expert])}
 
 
 def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:

@@ -189,22 +189,17 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(map(_markdown_text, line))} |\n" for line in lines)
 
 
-def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Raises a ValueError for a name that is not registered, and for one that is given twice."""
+def check_names(kind: str, names: Iterable[str], known: Iterable[str], least: int = 0) -> None:
+    """Raises a ValueError for a name that is not registered, for one that is given twice, and where there is none and `least` is 1."""
     names, known = list(names), list(known)
+    if len(names) < least:
+        raise ValueError(f"give at least one {kind}: {', '.join(known)}")
     unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(f"unknown {kind} {', '.join(unknown)}; known: {', '.join(known)}")
     repeated = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     if repeated:
         raise ValueError(f"{kind} {', '.join(repeated)} is given more than once; give each once")
-
-
-def check_some(kind: str, names: Sequence[str], known: Iterable[str]) -> None:
-    """As `check_names`; raises a ValueError also where there is no name at all."""
-    if not names:
-        raise ValueError(f"give at least one {kind}: {', '.join(known)}")
-    check_names(kind, names, known)
 
 
 def check_least(least: int, **numbers: int) -> None:
