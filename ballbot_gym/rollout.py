@@ -36,8 +36,9 @@ class Controller(Protocol):
 class ActionController:
     """A function from observation to action as a Controller. It gets the observations that the env would show.
 
-    This is the one place where an observation is turned into a force. It acts in B episodes at once, given states (B, 8) and
-    constants (B, nc), if the function takes observations (B, no). If `told` is given, (..., 3), these estimates of the three
+    This is the one place where an observation is turned into a force. `action` is the function, and `history` that of its
+    observations. It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the function takes observations
+    (B, no). If `told` is given, (..., 3), these estimates of the three
     factors in `ROBOT_FACTORS` are appended to the observation.
     """
 
@@ -50,7 +51,7 @@ class ActionController:
             action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
             history: of the observations, same as in `BallbotEnv`.
         """
-        self._task, self._params, self._action, self._history = task, params, action, history
+        self._task, self._params, self.action, self.history = task, params, action, history
         self._c: tuple[float, ...] = ()
         self._begins = True
         self.told: np.ndarray | None = None
@@ -62,13 +63,13 @@ class ActionController:
         own = np.array(self._task.seen(_components(x), self._task.at(self._c, t), self._params), np.float32).T
         if self._begins:
             still = np.zeros((*own.shape[:-1], self._params.action_size), np.float32)
-            self._past = np.tile(np.concatenate([own, still], -1), self._history)
-        observation = np.concatenate([own, self._past], -1) if self._history else own
+            self._past = np.tile(np.concatenate([own, still], -1), self.history)
+        observation = np.concatenate([own, self._past], -1) if self.history else own
         if self.told is not None:
             observation = np.concatenate([observation, self.told.astype(np.float32)], -1)
-        action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
+        action = real_array(self.action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
-        if self._history:
+        if self.history:
             tried = action.clip(-1.0, 1.0).astype(np.float32)
             self._past = np.concatenate([own, tried, self._past], -1)[..., : self._past.shape[-1]]
         return self._params.force_limit * action

@@ -163,10 +163,10 @@ def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
 
 
 def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_leaderboard
+    from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_results
 
     made = [Result("turn", "lqr", i, "rk4", 12.0, 10.0, True, False, 30.0, 2.0, 8.0, 0.1, 1e-5) for i in range(10)]
-    write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
+    write_results(leaderboard(made), made, {"commit": "a"}, folder)
 
     def read() -> None:
         leaderboard(read_results(folder)[1] or made)

@@ -31,7 +31,7 @@ from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train import evaluate, load_policy
 from ballbot_train.cli import _run
 from ballbot_train.evaluation.controllers import controllers_of
-from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
+from ballbot_train.evaluation.results import leaderboard, read_results, write_results
 from ballbot_train.learning import training
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
@@ -356,7 +356,7 @@ def results(edit=lambda text: text):
 
     def read(folder):
         made = [result(episode=i) for i in range(10)]
-        write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
+        write_results(leaderboard(made), made, {"commit": "a"}, folder)
         path = folder / "leaderboard.json"
         path.write_text(edit(path.read_text()))
         return read_results(path)

@@ -10,7 +10,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, ROBOTS, TRACKS, Randomization, default_params, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_leaderboard
+from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_results
 from ballbot_train.evaluation.submissions import read_entries
 
 SHIPPED = [(robot, name) for robot in ROBOTS for name in TASKS if not (robot.startswith("omni") and name == "weave")]
@@ -212,7 +212,7 @@ def test_what_is_of_another_version_of_the_benchmark_is_refused(tmp_path, monkey
     path = known.save(task, tmp_path / "set.npz", PAPER)
     assert certified.load("stabilize", PAPER, path).costs[0] == known.costs[0]
     result = Result("stabilize", "lqr", 0, "rk4", 1.0, 1.0, True, False)
-    write_leaderboard(leaderboard([result]), [result], {}, tmp_path)
+    write_results(leaderboard([result]), [result], {}, tmp_path)
     assert read_results(tmp_path)[0]["benchmark"] == "1"
     assert {entry.benchmark for entry in read_entries()} == {"1"}
     monkeypatch.setattr(version, "BENCHMARK", "2")

@@ -18,7 +18,7 @@ from ballbot_baselines import Optimum
 from ballbot_gym.rollout import Episode
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.evaluation.results import summarize
+from ballbot_train.evaluation.results import leaderboard
 
 GATE = Marker((1.0, 0.5), 0.3, 0.9, (0.8, 0.1, 0.1, 1.0))
 
@@ -44,7 +44,7 @@ SHOWN = {
     "episode": (episode(ride()), "cost 12.35"),
     "optimum": (optimum(ride()), "status optimal"),
     "row": (
-        summarize([replace(result(controller="<b>mine", cost=12.0 + i), episode=i) for i in range(5)]),
+        *leaderboard([replace(result(controller="<b>mine", cost=12.0 + i), episode=i) for i in range(5)]),
         "mean regret",
     ),
 }

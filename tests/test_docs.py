@@ -74,8 +74,9 @@ def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda episodes: 2)
     monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
     monkeypatch.setattr(fresh, "evaluate_fresh", lambda policy, task, count, *more: real(policy, task, 20, *more))
-    optima = fresh.find_optima
-    monkeypatch.setattr(fresh, "find_optima", lambda task, count, *more: optima(task, min(count, 2), *more))
+    optima = fresh.FreshResult.with_optima
+    few = lambda result, count, workers: optima(result, min(count, 2), workers)  # noqa: E731
+    monkeypatch.setattr(fresh.FreshResult, "with_optima", few)
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
         command = shlex.split(line, comments=True)

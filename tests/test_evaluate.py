@@ -21,14 +21,14 @@ from ballbot_gym.env import make_task
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import controllers, evaluate, runner
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.results import HEADER, cells, leaderboard, read_results, summarize, write_leaderboard
+from ballbot_train.evaluation.results import TABLE, leaderboard, read_results, table_cells, write_results
 from ballbot_train.policy.files import PolicySpec, shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, save_policy
 from ballbot_train.work import console
 
 
 def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():
-    row = summarize(
+    (row,) = leaderboard(
         [
             result(),
             result(episode=1, cost=14.0, success=False),
@@ -68,7 +68,7 @@ def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
 def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
     results = [result(), result(controller="trajopt", cost=10.0, settle_time=math.nan)]
     rows = leaderboard(results)
-    write_leaderboard(rows, results, {"commit": "none"}, tmp_path)
+    write_results(rows, results, {"commit": "none"}, tmp_path)
     with (tmp_path / "leaderboard.csv").open() as file:
         table = list(csv.DictReader(file))
     assert [entry["controller"] for entry in table] == ["lqr", "trajopt"]
@@ -81,7 +81,7 @@ def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
 @pytest.mark.parametrize("name", ["", "leaderboard.json"])
 def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
     results = [result(effort=20.0, note="no plan"), result(controller="trajopt", settle_time=math.nan, success=False)]
-    write_leaderboard(leaderboard(results), results, {"commit": "none"}, tmp_path)
+    write_results(leaderboard(results), results, {"commit": "none"}, tmp_path)
     about, read = read_results(tmp_path / name)
     assert repr(read) == repr(results)  # NaN is not equal to itself
     assert about == {"benchmark": "1", "commit": "none"}
@@ -92,7 +92,7 @@ def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
 )
 def test_a_name_is_no_formula_in_csv(name, tmp_path):
     results = [result(controller=name, note=name, effort=1.0)]
-    write_leaderboard(leaderboard(results), results, {}, tmp_path)
+    write_results(leaderboard(results), results, {}, tmp_path)
     with (tmp_path / "episodes.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert row["controller"][0] not in "=+-@\t\r"
@@ -231,8 +231,8 @@ def test_rows_and_files_say_their_engine(tmp_path):
         ("rk4", 1, "rk4"),
         ("mujoco", 1, "mujoco"),
     ]
-    assert [dict(zip(HEADER, cells(row), strict=True))["physics"] for row in rows] == ["rk4", "mujoco"]
-    write_leaderboard(rows, results, {}, tmp_path)
+    assert [dict(zip(TABLE, line, strict=True))["physics"] for line in table_cells(TABLE, rows)] == ["rk4", "mujoco"]
+    write_results(rows, results, {}, tmp_path)
     for name in ("leaderboard.csv", "episodes.csv"):
         with (tmp_path / name).open() as file:
             assert [entry["physics"] for entry in csv.DictReader(file)] == ["rk4", "mujoco"]

@@ -127,13 +127,12 @@ def test_wilson_s_interval_is_not_empty_where_nothing_failed():
 
 
 def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(monkeypatch):
-    optima = fresh.find_optima("stabilize", 2, 0, 1)
+    result = evaluate_fresh("shac", "stabilize", 2)
+    optima = result.with_optima(2, 1).optima
     from ballbot_baselines.optimum import certification
 
     monkeypatch.setattr(certification, "optimum_of", None)  # whoever calls it again fails
-    again = fresh.find_optima("stabilize", 2, 0, 1)
-    np.testing.assert_array_equal(optima, again)
-    result = evaluate_fresh("shac", "stabilize", 2)
+    np.testing.assert_array_equal(optima, result.with_optima(2, 1).optima)
     assert (result.costs / optima - 1 > -1e-6).all()
 
 

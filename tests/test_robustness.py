@@ -8,7 +8,7 @@ from builders import stress_result as result
 
 from ballbot_gym.robot import Randomization
 from ballbot_train.evaluation import robustness, runner
-from ballbot_train.evaluation.results import leaderboard, summarize, write_results
+from ballbot_train.evaluation.results import leaderboard, write_results
 from ballbot_train.evaluation.robustness import NONE, STRESSES
 from ballbot_train.report import figures
 
@@ -32,7 +32,7 @@ def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     plain = runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 3, tmp_path / "plain", 1)
     rows = leaderboard(results)
     assert [tuple(row.labels.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
-    assert rows[0].cost_mean == summarize(plain).cost_mean
+    assert rows[0].cost_mean == leaderboard(plain)[0].cost_mean
     costs = [row.cost_mean for row in rows]
     assert costs[0] == min(costs)
 
@@ -51,7 +51,7 @@ def test_files_hold_the_rows_and_the_figure_is_drawn(tmp_path):
     failed = {"failure": True, "success": False}
     results = [result(NONE, 0.0), result("mass", -20.0), result("mass", 20.0, **failed), result("lag", 20.0)]
     rows = leaderboard(results)
-    write_results("robustness", rows, results, {"commit": "none"}, tmp_path)
+    write_results(rows, results, {"commit": "none"}, tmp_path, "robustness")
     document = json.loads((tmp_path / "robustness.json").read_text())
     assert [(row["stress"], row["level"]) for row in document["rows"]] == [tuple(r.labels.values()) for r in results]
     assert document["rows"][2]["regret_mean"] is None

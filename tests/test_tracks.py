@@ -23,8 +23,9 @@ from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_gym.vector.episodes import run_episodes
 from ballbot_train import evaluate, load_policy
 from ballbot_train.commands.benchmark import benchmark
+from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.controllers import controllers_of, make_controller
-from ballbot_train.evaluation.fresh import as_batch_policy, evaluate_fresh
+from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started
 from ballbot_train.policy.export_onnx import export_onnx
@@ -124,12 +125,12 @@ def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, tr
 
 
 def test_a_batch_of_filters_does_what_one_does():
-    fresh = evaluate_fresh("shac-adaptive", "turn", 3, randomization="late")
+    result = evaluate_fresh("shac-adaptive", "turn", 3, randomization="late")
     env = BallbotEnv("turn", physics="rk4", randomization="late")
     controller = make_controller("shac-adaptive", env.task, env.params)
     for i in range(3):
-        given = {"state": fresh.states[i], "constants": fresh.constants[i], "drawn": fresh.drawn[i]}
-        assert rollout(env, controller, options=given).cost == pytest.approx(fresh.costs[i], rel=1e-4)
+        given = {"state": result.states[i], "constants": result.constants[i], "drawn": result.drawn[i]}
+        assert rollout(env, controller, options=given).cost == pytest.approx(result.costs[i], rel=1e-4)
 
 
 def test_a_policy_file_may_be_named_with_its_filter():
@@ -269,7 +270,9 @@ def test_an_informed_policy_acts_as_its_start_at_first_and_runs_behind_a_filter(
         started(informed, start.spec)
 
 
-def test_an_informed_policy_is_told_at_first_what_the_filter_knows_then_and_the_drawn_robot_afterwards(tmp_path):
+def test_an_informed_policy_is_told_at_first_what_the_filter_knows_then_and_the_drawn_robot_afterwards(
+    tmp_path, monkeypatch
+):
     import torch
 
     task = make_task("stabilize")
@@ -277,10 +280,13 @@ def test_an_informed_policy_is_told_at_first_what_the_filter_knows_then_and_the_
     informed = started(start, replace(start.spec, informed=True))
     for part in informed.parameters():
         part.data += 0.01
-    firsts = []
+    firsts, episodes = [], fresh.draw(task, range(4), 3, randomization=TRACKS["unknown"])
     for policy in (informed, save_policy(tmp_path / "policy", informed, {})):
-        batch = BallbotBatch(task, 4, randomization="unknown", compile=False, dtype=torch.float64)
-        seen, act = batch.reset(seed=3), as_batch_policy(policy, batch)
+        given = []
+        monkeypatch.setattr(fresh, "run_episodes", lambda batch, act, *_, given=given, **__: given.extend([batch, act]))
+        fresh.run_policy(policy, task, *episodes, randomization=TRACKS["unknown"], dtype=torch.float64)
+        batch, act = given
+        seen = batch.reset(seed=3)
         firsts.append(act(seen).detach().double())
         if policy is informed:
             drawn = batch.state.drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T

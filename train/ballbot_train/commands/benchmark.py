@@ -9,14 +9,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness
 from ballbot_train.evaluation.controllers import controllers_of
-from ballbot_train.evaluation.results import (
-    HEADER,
-    TABLE,
-    leaderboard,
-    table_cells,
-    write_leaderboard,
-    write_results,
-)
+from ballbot_train.evaluation.results import TABLE, leaderboard, table_cells
 from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
 from ballbot_train.report.page import report_page
@@ -68,14 +61,12 @@ def benchmark(
         groups = robustness.groups_of(chosen, randomization, physics, robot, experts)
         results = run_groups(groups, episodes, out, workers, seed)
         rows = robustness.track_rows(results, robot, seed)
-        write_results("tracks", rows, results, facts, out)
         title = f"{episodes} certified episodes per task and track, physics={physics}"
-        publish(out, "tracks", title, robustness.TRACK_TABLE, rows, facts)
+        publish(out, "tracks", title, robustness.TRACK_TABLE, rows, results, facts)
         return
     groups = [Group(task, name, physics, robot) for task, names in chosen.items() for name in names]
     done = run_groups(groups, episodes, out, workers, seed, record=True)
     rows, ways = leaderboard(done, seed), facts.get("trained_by", {})
-    write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done, ways), out / "figures" / "regret.png")
     replays, pictures = [], []
     for task, names in chosen.items():
@@ -89,9 +80,10 @@ def benchmark(
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
     drawn = replays if isinstance(named_robot(robot), Ballbot) else []  # the page draws ballbots
-    report = report_page(title, drawn, HEADER, table_cells(TABLE, rows, ways), shown, facts)
+    report = report_page(title, drawn, [*TABLE], table_cells(TABLE, rows, ways), shown, facts)
     page = files.write(out / "report.html", report)
-    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows, facts)
+    title = f"{episodes} certified episodes per task, physics={physics}"
+    publish(out, "leaderboard", title, TABLE, rows, done, facts)
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")

@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from ballbot_gym.rollout import rollout
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation.controllers import behind, controllers_of, make_controller, policy_digests, task_name
 from ballbot_train.evaluation.names import file_part
-from ballbot_train.evaluation.results import TABLE, leaderboard, write_leaderboard
+from ballbot_train.evaluation.results import TABLE, leaderboard
 from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
 from ballbot_train.work import jobs
 from ballbot_train.work.console import (
@@ -92,8 +91,8 @@ def evaluate(
     group = Group(task, policy, engine, robot, randomization=varied, own_optima=True)
     results = run_groups([group], count, out, workers, seed, record=not varied.active)
     rows = leaderboard(results, seed)
-    write_leaderboard(rows, results, facts, out)
-    publish(out, "leaderboard", f"{count} certified episodes of {task}, physics={engine}", TABLE, rows, facts)
+    title = f"{count} certified episodes of {task}, physics={engine}"
+    publish(out, "leaderboard", title, TABLE, rows, results, facts)
     console.print(f"all episodes: {out / 'episodes.csv'}")
 
 
@@ -111,10 +110,9 @@ def _evaluate_fresh(
     """A policy on fresh episodes: failures, success and cost by what makes episodes hard, and the worst ten."""
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
-    episodes.check_fresh(count, seed)
     if optima > count:
         raise ValueError(f"optima must be at most the {count} fresh episodes, not {optima}")
-    episodes.history_of(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
+    episodes.check_fresh(policy, make_task(task, robot), count, seed, robot)  # before anything is written
     jobs.make_folder(out)
     of = {"task": task, "policy": policy, "robot": robot, "randomization": track_of(varied)}
     if (out / "fresh.json").exists():  # of the same policy they are replaced
@@ -132,9 +130,9 @@ def _evaluate_fresh(
         progress = partial(advance, "episodes")
         result = episodes.evaluate_fresh(policy, task, count, seed, None, progress, robot, varied)
     if optima:
-        result = replace(result, optima=episodes.find_optima(task, optima, seed, workers, robot, varied))
+        result = result.with_optima(optima, workers)
     worst = _worst(result, policy, task, out / "worst", robot, varied)
-    episodes.write(result, worst, facts, out)
+    result.write(worst, facts, out)
     _print(result, worst)
     console.print(f"all episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
 

@@ -15,7 +15,7 @@ from ballbot_gym import files
 from ballbot_gym.robot import check_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.evaluate import evaluate
-from ballbot_train.evaluation.results import HEADER, cells
+from ballbot_train.evaluation.results import TABLE, table_cells
 from ballbot_train.work.console import check_least, console, markdown, physics_or_default
 
 _TEMPLATES = Path(__file__).parent / "template"
@@ -95,6 +95,6 @@ def _leaderboard(name: str, out: Path, episodes: int) -> str:
     sys.path.append(os.path.abspath(out))
     import_module(_module_of(name))
     physics = physics_or_default(None)
-    rows = [cells(evaluate(expert, name, episodes, physics)) for expert in _FIRST]
+    rows = table_cells(TABLE, [evaluate(expert, name, episodes, physics) for expert in _FIRST])
     command = f"ballbot benchmark --tasks {name} --controllers {' '.join(_FIRST)} --episodes {episodes}"
-    return f"The first {episodes} episodes, physics={physics}: `{command}`\n\n{markdown(HEADER, rows)}"
+    return f"The first {episodes} episodes, physics={physics}: `{command}`\n\n{markdown([*TABLE], rows)}"

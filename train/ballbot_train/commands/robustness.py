@@ -8,7 +8,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.controllers import controllers_of
-from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
+from ballbot_train.evaluation.results import Row, leaderboard, shown
 from ballbot_train.evaluation.runner import checked_episodes, open_run, publish, run_groups
 from ballbot_train.report import figures
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
@@ -50,8 +50,6 @@ def robustness(
     facts = open_run(out, workers, {robot: chosen}, robot, **settings)
     results = run_groups(stressed.groups_of(chosen, stresses, physics, robot), episodes, out, workers, seed)
     rows = leaderboard(results, seed)
-    labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
-    write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
         figures.save(
             figures.robustness_figure(rows, task, facts.get("trained_by", {})),
@@ -64,7 +62,8 @@ def robustness(
         for controller in group
     ]
     title = f"{episodes} certified episodes per task and severity, physics={physics}"
-    publish(out, "robustness", title, _TABLE, curves, facts)
+    labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
+    publish(out, "robustness", title, _TABLE, rows, results, facts, curves, stresses=labels)
     console.print(f"curves: {out / 'figures'}")
 
 

@@ -11,7 +11,7 @@ from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation.controllers import controllers_of
-from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
+from ballbot_train.evaluation.results import Row, leaderboard, shown
 from ballbot_train.evaluation.runner import Group, checked_episodes, floor, open_run, publish, run_groups
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
 from ballbot_train.work.executors import Workers
@@ -90,6 +90,6 @@ def transfer(
     ]
     results = run_groups(groups, episodes, out, workers, seed)
     rows = leaderboard(results, seed)
-    write_results("transfer", rows, results, facts, out, _IN_CSV, regret=_REGRET)
-    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows, facts)
+    title = f"{episodes} certified episodes of {robot} per task"
+    publish(out, "transfer", title, _TABLE, rows, results, facts, renamed=_IN_CSV, regret=_REGRET)
     console.print(f"matrix: {out / 'transfer.csv'}")

@@ -6,6 +6,7 @@ Importing this module is light: torch is imported for policy files, CasADi for e
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -17,9 +18,9 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_train.evaluation import counterparts, optima, recordings
 from ballbot_train.evaluation.controllers import as_controller, behind, is_file, policy_digest
-from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.evaluation.runner import checked_episodes, run_episodes, shown_to
-from ballbot_train.work.console import late_bar
+from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, write_results
+from ballbot_train.evaluation.runner import checked_episodes, run_episodes
+from ballbot_train.work.console import progress_bars
 from ballbot_train.work.executors import Workers
 from ballbot_train.work.provenance import provenance
 
@@ -114,16 +115,20 @@ def evaluate(
         if counterpart := counterparts.counterpart_of(task):
             policy = counterparts.translated(policy, counterpart, env.task, env.params)
         controller = as_controller(policy, env.task, env.params, filter)
-        env = shown_to(controller, env)
+        if getattr(controller, "senses", False):
+            env.close()
+            env = BallbotEnv(
+                env.task, env.physics, params=env.params, randomization=env.randomization, observation="sensors"
+            )
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         file = str(Path(policy).absolute()) if isinstance(policy, str | Path) and is_file(str(policy)) else ""
         held = None if out is None else _Held.of(Path(out))
         on = name_of(env.task) or type(env.task).__name__.lower()
         named = name or behind(_name(policy, file, on, held), filter), on
         motions: list[recordings.Recording] = []
-        with late_bar("episodes", len(indices)) as advance:
-            results = run_episodes(env, controller, *named, indices, 0, known, motions, advance)
-        row = summarize(results)
+        with progress_bars({"episodes": len(indices)}, late=True) as advance:
+            results = run_episodes(env, controller, *named, indices, 0, known, motions, partial(advance, "episodes"))
+        (row,) = leaderboard(results)
         if out is not None and held is not None:
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": env.params.record()}
             digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
@@ -134,7 +139,7 @@ def evaluate(
                 "files": {key: file} if file else {},
             }
             results, facts = held.joined(Path(out), ran, more, results)
-            write_leaderboard(leaderboard(results), results, provenance() | facts, Path(out))
+            write_results(leaderboard(results), results, provenance() | facts, Path(out))
             if not env.randomization.active:
                 who = env.physics, named[0], digest
                 recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)

@@ -13,7 +13,7 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -23,16 +23,17 @@ from ballbot_gym import files
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
+from ballbot_gym.registry import name_of
 from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
-from ballbot_gym.rollout import Controller, PlanError
+from ballbot_gym.rollout import ActionController, Controller, PlanError
 from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
-from ballbot_gym.vector.episodes import run_episodes
-from ballbot_train.evaluation.controllers import Predictor, is_expert, make_controller
+from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
+from ballbot_train.evaluation.controllers import as_controller, is_expert, make_controller
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
-from ballbot_train.policy.network import PolicyController, PolicyNetwork
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work.console import progress_bars
 from ballbot_train.work.executors import Workers, completed
 
@@ -106,6 +107,10 @@ class FreshResult:
     """(k,) optimal costs of the first k ≤ n episodes; NaN where none was found."""
     drawn: np.ndarray
     """(n, 6 or 14) what a randomization drew for the episodes, or (n, 0)."""
+    robot: str = PAPER
+    """By name."""
+    randomization: Randomization = Randomization()
+    """Parameters hidden from the policy."""
 
     def __len__(self) -> int:
         return len(self.costs)
@@ -162,6 +167,29 @@ class FreshResult:
         """The indices of the worst episodes: those without success first, and then the dearest."""
         return np.lexsort((-self.costs, -priced(self.costs, self.success, self.task)))[:count].tolist()
 
+    def with_optima(self, count: int, workers: int | Workers) -> "FreshResult":
+        """The same with the optima of its first `count` episodes, NaN where none was found. They stay in the user's cache."""
+        task, params, costs = self.task, named_robot(self.robot), np.full(count, np.nan)
+        folder = cache.folder(task, params, self.randomization) / f"fresh-{self.seed}"
+        name = name_of(task) or task.id
+
+        def missing() -> Iterator[Any]:
+            for i in range(count):
+                path = folder / f"{i:06d}.json"
+                try:
+                    costs[i] = files.read_json(path, kind=float)
+                    advance(name, 1)
+                except files.FileError:
+                    x, c, drawn = self.states[i], self.constants[i], tuple(self.drawn[i].tolist())
+                    yield (i, path), _optimal_cost, (task, params, x, c, self.randomization, drawn)
+
+        with progress_bars({name: count}) as advance:
+            for (i, path), cost in completed(missing(), workers):
+                files.write(path, json.dumps(cost))
+                costs[i] = cost
+                advance(name, 1)
+        return replace(self, optima=costs)
+
     def episode(self, i: int) -> dict[str, Any]:
         """What episode i was and how it ended, as a line of a table."""
         ending = self.violated[i] or ("" if self.success[i] else "goal missed")
@@ -174,6 +202,19 @@ class FreshResult:
             "duration": float(self.durations[i]),
             **{name: float(values[i]) for name, values in self.measures.items()},
         }
+
+    def write(self, worst: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], out: Path) -> None:
+        """Writes fresh.json, with the facts as "about", summary, bins and worst episodes; and bins, worst and fresh.csv.
+
+        fresh.csv has a line for each episode.
+        """
+        bins = self.bins()
+        document = {"about": facts, "summary": [self.summary()], "bins": bins, "worst": list(worst)}
+        files.write(out / "fresh.json", to_json(document))
+        files.write_csv(out / "bins.csv", bins)
+        flat = ("start", "constants")  # lists, which are in the JSON file
+        files.write_csv(out / "worst.csv", [{key: entry[key] for key in entry if key not in flat} for entry in worst])
+        files.write_csv(out / "fresh.csv", [self.episode(i) for i in range(len(self))])
 
 
 def _spread(name: str, values: np.ndarray) -> dict[str, float]:
@@ -220,65 +261,73 @@ def draw(
     return x, c, robots
 
 
-def history_of(policy: Any, task: Task, robot: str = PAPER) -> int:
-    """How many earlier observations a policy wants to see, that is given as to `as_batch_policy`."""
-    if isinstance(policy, str | Path):
-        policy = getattr(_controller(str(policy), task, robot), "network", None)
-    if callable(getattr(policy, "predict", None)):
-        return Predictor(policy, task, named_robot(robot)).history
-    return getattr(policy, "history", 0)
-
-
-BatchPolicy = Callable[[torch.Tensor], torch.Tensor]
-"""From observations (B, no) to actions (B, 2)."""
-
-
-def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> BatchPolicy:
-    """A policy as a function from observations to actions, for one episode of each environment of a batch.
+def run_policy(
+    policy: Any,
+    task: Task,
+    x: np.ndarray,
+    c: np.ndarray,
+    drawn: np.ndarray,
+    robot: str = PAPER,
+    randomization: Randomization = Randomization(),
+    dtype: torch.dtype = torch.float32,
+) -> BatchEpisodes:
+    """Runs B episodes under a policy, all at once in the batched closed-form model.
 
     Args:
         policy: a policy file, a saved model, the name of a shipped policy, perhaps followed by that of a filter, a model with
             Stable-Baselines3's `predict`, or a function of tensors such as a `PolicyNetwork`. It gets float32.
-        batch: where it acts.
-        robot: by name, of a policy by name or file.
+        task: the task.
+        x: (B, 8) initial states.
+        c: (B, nc) constants.
+        drawn: what `draw` gives for the episodes.
+        robot: by name.
+        randomization: what varies.
+        dtype: in which the model computes.
 
     Raises:
         ValueError: nothing of that name, or a controller that does not run in the batch.
         PolicyError: a policy file that is damaged or of another task.
         TypeError: it is none of these.
     """
+    policy = _acting(policy, task, robot)
+    world: dict[str, Any] = {"randomization": randomization, "history": getattr(policy, "history", 0)}
+    batch = BallbotBatch(task, len(x), compile=False, dtype=dtype, robot=robot, **world)
+    return run_episodes(batch, _act(policy, batch), x, c, drawn=drawn if drawn.shape[1] else None)
+
+
+def _acting(policy: Any, task: Task, robot: str) -> Any:
+    """What acts in many episodes at once: a Controller, or a function of tensors."""
+    params = named_robot(robot)
     if isinstance(policy, str | Path):
-        controller = _controller(str(policy), batch.task, robot)
-        if not isinstance(controller, PolicyController):
-            return _behind_filter(controller, batch)
-        policy = controller
+        controller = None if is_expert(str(policy)) else make_controller(str(policy), task, params)
+        if controller is None or getattr(controller, "senses", False):
+            what = "an expert" if controller is None else "behind the filter of sensors"
+            raise ValueError(
+                f"{policy} is {what}, which acts in one episode at a time, and fresh episodes run all at once; give a "
+                "policy, or run it on certified episodes with ballbot benchmark"
+            )
+        return controller
     if callable(getattr(policy, "predict", None)):
-        predictor = Predictor(policy, batch.task, named_robot(robot))
+        return as_controller(policy, task, params)
+    if not callable(policy):
+        raise TypeError(f"{policy!r} is no policy: give a name, a file, a model with predict, or a function of tensors")
+    return policy
+
+
+def _act(policy: Any, batch: BallbotBatch) -> Callable[[torch.Tensor], torch.Tensor]:
+    """What acts as a function from observations (B, no) to actions (B, 2), for one episode of each environment of a batch."""
+    if isinstance(policy, ActionController):
         begins = itertools.chain([True], itertools.repeat(False))
-        return lambda observation: torch.as_tensor(
-            predictor(observation.float().numpy(), next(begins)), device=observation.device
-        )
+        return lambda seen: torch.as_tensor(policy.action(seen.float().numpy(), next(begins)), device=seen.device)
+    if not callable(policy):
+        return _behind_filter(policy, batch)
     if isinstance(policy, PolicyNetwork) and policy.spec.informed:
         return lambda seen: policy.knowing(seen.float(), cast(BatchState, batch.state), batch.randomization)
-    if callable(policy):
-        function: Any = policy
-        return lambda observation: function(observation.float())
-    raise TypeError(f"{policy!r} is no policy: give a name, a file, a model with predict, or a function of tensors")
+    function: Any = policy
+    return lambda seen: function(seen.float())
 
 
-def _controller(policy: str, task: Task, robot: str) -> Controller:
-    """The controller of that name, which acts in many episodes at once."""
-    controller = None if is_expert(policy) else make_controller(policy, task, named_robot(robot))
-    if controller is None or getattr(controller, "senses", False):
-        what = "an expert" if controller is None else "behind the filter of sensors"
-        raise ValueError(
-            f"{policy} is {what}, which acts in one episode at a time, and fresh episodes run all at once; give a "
-            "policy, or run it on certified episodes with ballbot benchmark"
-        )
-    return controller
-
-
-def _behind_filter(controller: Controller, batch: BallbotBatch) -> BatchPolicy:
+def _behind_filter(controller: Controller, batch: BallbotBatch) -> Callable[[torch.Tensor], torch.Tensor]:
     """The controller as a function of observations. It ignores them, and takes the readings of the batch's sensors."""
     steps = itertools.count()
 
@@ -305,7 +354,7 @@ def evaluate_fresh(
     """Runs a policy on fresh episodes.
 
     Args:
-        policy: see `as_batch_policy`.
+        policy: see `run_policy`.
         task: a name in `TASKS`, or a Task.
         episodes: how many.
         seed: of the episodes.
@@ -318,15 +367,12 @@ def evaluate_fresh(
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
     """
     task, params, varied = make_task(task, robot), named_robot(robot), checked_randomization(randomization)
-    check_fresh(episodes, seed)
-    world: dict[str, Any] = {"randomization": varied, "history": history_of(policy, task, robot)}
+    check_fresh(policy, task, episodes, seed, robot)
     states, constants, drawn = draw(task, range(episodes), seed, robot=robot, randomization=varied)
     runs = []
     for start in range(0, episodes, _BATCH):
-        x, c = states[start : start + _BATCH], constants[start : start + _BATCH]
-        batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64, robot=robot, **world)
-        some = drawn[start : start + _BATCH] if drawn.shape[1] else None
-        runs.append(run_episodes(batch, as_batch_policy(policy, batch, robot), x, c, drawn=some))
+        x, c, own = (part[start : start + _BATCH] for part in (states, constants, drawn))
+        runs.append(run_policy(policy, task, x, c, own, robot, varied, torch.float64))
         on_progress(len(x))
     described = [task.measures(x, c, params) for x, c in zip(states, constants, strict=True)]
     vary = {name: row for name, row in zip(Randomization.DRAWN, drawn.T, strict=False) if np.ptp(row) > 0}
@@ -346,54 +392,18 @@ def evaluate_fresh(
         measures={key: np.array([entry[key] for entry in described]) for key in described[0]} | vary,
         optima=np.zeros(0),
         drawn=drawn,
+        robot=robot,
+        randomization=varied,
     )
 
 
-def check_fresh(episodes: int, seed: int) -> None:
-    """Raises a ValueError for a number of fresh episodes, or a seed, that is out of its range."""
+def check_fresh(policy: Any, task: Task, episodes: int, seed: int, robot: str = PAPER) -> None:
+    """Raises the error of `run_policy` for what is no policy, and a ValueError for a number that is out of its range."""
     if not 1 <= episodes <= _MOST_EPISODES:
         raise ValueError(f"the number of fresh episodes must be 1 to {_MOST_EPISODES:,}, not {episodes}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
-
-
-def find_optima(
-    task: str,
-    episodes: int,
-    seed: int,
-    workers: int | Workers,
-    robot: str = PAPER,
-    randomization: Randomization = Randomization(),
-) -> np.ndarray:
-    """(n,) optimal costs of the first fresh episodes of a seed, NaN where none was found. They stay in the user's cache.
-
-    Args:
-        task: name of the task.
-        episodes: how many.
-        seed: of the episodes.
-        workers: a number of processes, or `Workers`.
-        robot: by name.
-        randomization: what the robot and the delay of each episode are drawn from.
-    """
-    problem, params, costs = make_task(task, robot), named_robot(robot), np.full(episodes, np.nan)
-    starts = draw(problem, range(episodes), seed, robot=robot, randomization=randomization)
-    folder = cache.folder(problem, params, randomization) / f"fresh-{seed}"
-
-    def missing() -> Iterator[Any]:
-        for i, (x, c, drawn) in enumerate(zip(*starts, strict=True)):
-            path = folder / f"{i:06d}.json"
-            try:
-                costs[i] = files.read_json(path, kind=float)
-                advance(task, 1)
-            except files.FileError:
-                yield (i, path), _optimal_cost, (problem, params, x, c, randomization, tuple(drawn.tolist()))
-
-    with progress_bars({task: episodes}) as advance:
-        for (i, path), cost in completed(missing(), workers):
-            files.write(path, json.dumps(cost))
-            costs[i] = cost
-            advance(task, 1)
-    return costs
+    _acting(policy, task, robot)
 
 
 def _optimal_cost(*problem: Any) -> float:
@@ -403,18 +413,3 @@ def _optimal_cost(*problem: Any) -> float:
         return optimum_of(*problem).cost
     except PlanError:
         return math.nan
-
-
-def write(result: FreshResult, worst: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes fresh.json, with the facts as "about", summary, bins and worst episodes; and bins, worst and fresh.csv.
-
-    fresh.csv has a line for each episode.
-    """
-    bins = result.bins()
-    files.write(
-        out / "fresh.json", to_json({"about": facts, "summary": [result.summary()], "bins": bins, "worst": list(worst)})
-    )
-    files.write_csv(out / "bins.csv", bins)
-    flat = ("start", "constants")  # lists, which are in the JSON file
-    files.write_csv(out / "worst.csv", [{key: entry[key] for key in entry if key not in flat} for entry in worst])
-    files.write_csv(out / "fresh.csv", [result.episode(i) for i in range(len(result))])

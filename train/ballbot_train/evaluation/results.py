@@ -15,6 +15,8 @@ from ballbot_gym.trajectory import Displayed
 from ballbot_train.evaluation.names import shortened, with_way
 from ballbot_train.evaluation.statistics import interval
 
+_LEADERBOARD = "leaderboard"
+
 
 @dataclass(frozen=True)
 class Result:
@@ -85,7 +87,7 @@ class Row(Displayed):
         }
 
 
-def summarize(results: Sequence[Result], seed: int = 0) -> Row:
+def _row(results: Sequence[Result], seed: int) -> Row:
     """The leaderboard row of one controller on one task; seed is of the bootstrap."""
     standing = [result for result in results if not result.failure]
 
@@ -117,7 +119,7 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
     )
 
 
-def columns(entry: Any) -> dict[str, Any]:
+def _columns(entry: Any) -> dict[str, Any]:
     """The fields of a dataclass instance by name, followed by the labels of a result or a row."""
     named = asdict(entry)
     labels = named.pop("labels", {})
@@ -129,34 +131,30 @@ def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in results:
         groups.setdefault((result.task, result.controller, result.physics, *result.labels.items()), []).append(result)
-    return [summarize(group, seed) for group in groups.values()]
+    return [_row(group, seed) for group in groups.values()]
 
 
 def write_results(
-    name: str,
     rows: Sequence[Row],
     results: Sequence[Result],
     facts: Mapping[str, Any],
     out: Path,
+    name: str = _LEADERBOARD,
     renamed: Mapping[str, str] = {},
     **more: Any,
 ) -> None:
     """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", with the version of the
-    benchmark, the rows, and more.
+    benchmark, the rows, and more. leaderboard.json holds the episodes too, which `read_results` reads.
 
     Some columns of the CSV files may have other names than the fields.
     """
     for table, entries in ((name, rows), ("episodes", results)):
-        named = [{renamed.get(key, key): value for key, value in columns(entry).items()} for entry in entries]
+        named = [{renamed.get(key, key): value for key, value in _columns(entry).items()} for entry in entries]
         files.write_csv(out / f"{table}.csv", named)
-    files.write(
-        out / f"{name}.json", to_json({"about": {"benchmark": version.BENCHMARK, **facts}, **more, "rows": rows})
-    )
-
-
-def write_leaderboard(rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes leaderboard.csv, episodes.csv and leaderboard.json, which `read_results` reads."""
-    write_results("leaderboard", rows, results, facts, out, episodes=results)
+    if name == _LEADERBOARD:
+        more["episodes"] = results
+    about = {"benchmark": version.BENCHMARK, **facts}
+    files.write(out / f"{name}.json", to_json({"about": about, **more, "rows": rows}))
 
 
 def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
@@ -169,7 +167,7 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
         ValueError: it is none of these, damaged, or of another version of the benchmark.
     """
     path = Path(path)
-    path = path / "leaderboard.json" if path.is_dir() else path
+    path = path / f"{_LEADERBOARD}.json" if path.is_dir() else path
     try:
         document = files.read_json(path)
         about, results = dict(document["about"]), [_from_json(entry) for entry in document["episodes"]]
@@ -202,7 +200,7 @@ def to_json(document: Mapping[str, Any]) -> str:
     """A document as JSON; its lists of dataclass instances become lists of objects, one a line, with null for NaN."""
 
     def line(entry: Any) -> str:
-        return json.dumps({key: _or_null(value) for key, value in columns(entry).items()}, ensure_ascii=False)
+        return json.dumps({key: _or_null(value) for key, value in _columns(entry).items()}, ensure_ascii=False)
 
     def text(value: Any) -> str:
         if isinstance(value, list | tuple) and value and hasattr(value[0], "__dataclass_fields__"):
@@ -242,12 +240,6 @@ TABLE: dict[str, Callable[[Row], str]] = {
     "per step": lambda row: shown(row.step_us_median, ".0f", " µs"),
 }
 """What the leaderboard's table shows of a row: behind the mean regret its interval; what does not exist is a dash."""
-HEADER = list(TABLE)
-
-
-def cells(row: Row) -> list[str]:
-    """A row as text, under `HEADER`."""
-    return [text(row) for text in TABLE.values()]
 
 
 def table_cells(

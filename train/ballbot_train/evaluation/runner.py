@@ -11,7 +11,7 @@ import numbers
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.results import Result, columns, table_cells
+from ballbot_train.evaluation.results import Result, Row, table_cells, write_results
 from ballbot_train.policy.files import network_digest, shipped_ways, weights_digest
 from ballbot_train.work import jobs
 from ballbot_train.work.console import check_least, markdown, print_table
@@ -89,14 +89,27 @@ def publish(
     name: str,
     title: str,
     shown: Mapping[str, Callable[[Any], str]],
-    rows: Sequence[Any],
-    facts: Mapping[str, Any] = {},
+    rows: Sequence[Row],
+    results: Sequence[Result],
+    facts: Mapping[str, Any],
+    lines: Sequence[Any] | None = None,
+    **more: Any,
 ) -> None:
-    """Ends a run: writes its table as NAME.md, and prints it. It has what is `shown` of each row, by header.
+    """Ends a run: writes its results, and its table as NAME.md, which it prints too.
 
-    `facts` are those of `open_run`, by which shipped policies are called by the whole way of their training.
+    Args:
+        out: the folder of the run.
+        name: of the files.
+        title: of the table.
+        shown: what the table shows of each line, by header.
+        rows: see `write_results`, as the results of all episodes and more.
+        results: of every episode.
+        facts: of `open_run`. Shipped policies are called by the whole way of their training.
+        lines: of the table; default, the rows.
+        more: what else the files hold.
     """
-    header, table = list(shown), table_cells(shown, rows, facts.get("trained_by", {}))
+    write_results(rows, results, facts, out, name, **more)
+    header, table = list(shown), table_cells(shown, rows if lines is None else lines, facts.get("trained_by", {}))
     files.write(out / f"{name}.md", markdown(header, table))
     jobs.release(out)
     print_table(title, header, table)
@@ -190,7 +203,7 @@ def run_groups(
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
             who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
             recordings.write_in(out, motions, task, group.task, params, *who)
-        results += [Result(**entry, labels=group.labels) for entry in entries]
+        results += [Result(**{**entry, "labels": group.labels}) for entry in entries]
     return results
 
 
@@ -232,24 +245,17 @@ def _episode_entries(
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     robot, varied = floor(group.robot, group.friction), group.randomization
-    env = BallbotEnv(group.task, physics=group.physics, randomization=varied, robot=robot, **group.fields)
     made = registry.as_controller(sent, *group.believed)
-    env = shown_to(made, env)
+    world: dict[str, Any] = {"randomization": varied, "robot": robot, **group.fields}
+    if getattr(made, "senses", False):
+        world["observation"] = "sensors"
+    env = BallbotEnv(group.task, physics=group.physics, **world)
     motions: list[recordings.Recording] | None = [] if record else None
     results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)
     env.close()
     for i, result in enumerate(results):
-        yield columns(result) | (
-            {"motion": base64.b64encode(recordings.to_bytes(motions[i])).decode()} if motions is not None else {}
-        )
-
-
-def shown_to(controller: Controller, env: BallbotEnv) -> BallbotEnv:
-    """An env of the same world that shows what a controller takes: sensors, if it `senses`."""
-    if not getattr(controller, "senses", False):
-        return env
-    env.close()
-    return BallbotEnv(env.task, env.physics, params=env.params, randomization=env.randomization, observation="sensors")
+        moved = {} if motions is None else {"motion": base64.b64encode(recordings.to_bytes(motions[i])).decode()}
+        yield asdict(result) | moved
 
 
 def checked_episodes(episodes: int) -> int:

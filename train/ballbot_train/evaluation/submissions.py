@@ -27,7 +27,7 @@ from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError, judged
-from ballbot_train.evaluation.results import Result, read_results, summarize, to_json
+from ballbot_train.evaluation.results import Result, leaderboard, read_results, to_json
 
 LEAST_REGRET = {"rk4": (-1e-3, -1e-4), "bullet": (-0.01, -0.002), "mujoco": (-0.01, -0.002)}
 """Of an episode, and of the mean of a row: what the engine's difference from the optimum's closed form explains."""
@@ -285,7 +285,7 @@ def _optimal_motions(steps: Steps, known: certified.EvaluationSet) -> int:
 
 def summary(entry: Entry) -> dict[str, Any]:
     """The fields of a row that follow from its episodes."""
-    row = summarize(entry.results())
+    (row,) = leaderboard(entry.results())
     regrets = {name: getattr(row, name) for name in ("regret_mean", "regret_low", "regret_high", "regret_median")}
     shown = {name: float(f"{value:.6g}") if math.isfinite(value) else None for name, value in regrets.items()}
     return {"success": row.success, "falls": row.falls, **shown}

@@ -51,10 +51,9 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import digest, problem_parts
-from ballbot_gym.vector.batch import BallbotBatch
-from ballbot_gym.vector.episodes import run_episodes
-from ballbot_train.evaluation import evaluate, fresh, runner
+from ballbot_train.evaluation import fresh, runner
 from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.results import Row, leaderboard
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
 from ballbot_train.policy.files import content_digest
@@ -121,7 +120,7 @@ def score_and_validate(
 ) -> dict[str, float]:
     """Measures a policy on the certified episodes and on the validation set, which shares none with others, in one batch.
 
-    With a randomization the optima are those of its episodes. A policy is what `fresh.as_batch_policy` takes.
+    With a randomization the optima are those of its episodes. A policy is what `fresh.run_policy` takes.
 
     | figure | is |
     |---|---|
@@ -139,10 +138,7 @@ def score_and_validate(
     if own.shape[1] != robots.shape[1]:  # the track moves no optimum
         own = fresh.draw(task, range(count), _CERTIFIED_SEED, "validation", robot, randomization)[2]
     drawn, states, constants = map(np.concatenate, ((own, robots), (known.states, x), (known.constants, c)))
-    history = fresh.history_of(policy, task, robot)
-    batch = BallbotBatch(task, len(states), compile=False, robot=robot, randomization=randomization, history=history)
-    act = fresh.as_batch_policy(policy, batch, robot)
-    run = run_episodes(batch, act, states, constants, drawn=drawn if drawn.shape[1] else None)
+    run = fresh.run_policy(policy, task, states, constants, drawn, robot, randomization)
     cost, success, failure = run.cost.double().numpy(), run.success.numpy(), run.failure.numpy()
     priced = fresh.priced(cost, success, task)
     standing = (cost[:count] / known.costs - 1)[~failure[:count]]
@@ -169,7 +165,7 @@ def train(
     out: Path,
     resume: bool = False,
     test_episodes: int = certified.EPISODES,
-) -> evaluate.Row:
+) -> Row:
     """Runs a learner to its end and measures the best policy in PyBullet. Ctrl-C saves and stops.
 
     Args:
@@ -326,14 +322,14 @@ class _Run:
         torch.save(state, buffer)
         files.write(self.out / "checkpoint.pt", buffer.getvalue())
 
-    def measure(self, count: int) -> evaluate.Row:
+    def measure(self, count: int) -> Row:
         """Measures the best policy on the first certified episodes in PyBullet, and adds the result to its JSON file."""
         network = load_network(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
         controller = make_controller(str(self.out / "policy.json"), self.task, env.params)
         results = runner.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
-        row = evaluate.summarize(results)
+        (row,) = leaderboard(results)
         figures = ("episodes", "success", "falls", "regret_mean", "regret_median")
         measured = {name: getattr(row, name) for name in figures}
         self._save_policy(network, measured={"episodes_are": "certified", "physics": env.physics} | measured)

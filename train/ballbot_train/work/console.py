@@ -73,7 +73,7 @@ console = PlainConsole(width=None if sys.stdout.isatty() else 160, force_jupyter
 LINE_SECONDS = 10.0
 """How often progress is printed into a file or a pipe."""
 LATE_SECONDS = 2.0
-"""After how long `late_bar` shows."""
+"""After how long bars show that come late."""
 
 
 class _SpeedColumn(ProgressColumn):
@@ -140,28 +140,23 @@ def progress_bar() -> Progress:
 
 
 @contextmanager
-def progress_bars(totals: Mapping[str, int]) -> Iterator[Callable[[str, int], None]]:
-    """Shows a bar for every name while the block runs; the numbers are how many steps each has. Gives what moves one on."""
-    with progress_bar() as progress:
-        bars = {name: progress.add_task(printable(name), total=total) for name, total in totals.items()}
-        yield lambda name, count: progress.advance(bars[name], count)
+def progress_bars(totals: Mapping[str, int], late: bool = False) -> Iterator[Callable[[str, int], None]]:
+    """Shows a bar for every name while the block runs; the numbers are how many steps each has. Gives what moves one on.
 
-
-@contextmanager
-def late_bar(name: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Shows one bar, on a terminal alone, when the block has taken `LATE_SECONDS`. Gives what moves it on, and shows it."""
-    if not console.is_terminal:
-        yield lambda count: None
-        return
+    Late bars show on a terminal alone, when the block has taken `LATE_SECONDS`.
+    """
     begin, progress = time.monotonic(), progress_bar()
-    bar = progress.add_task(printable(name), total=total)
+    bars = {name: progress.add_task(printable(name), total=total) for name, total in totals.items()}
 
-    def advance(count: int) -> None:
-        if not progress.live.is_started and time.monotonic() - begin >= LATE_SECONDS:
+    def advance(name: str, count: int) -> None:
+        is_due = late and console.is_terminal and time.monotonic() - begin >= LATE_SECONDS
+        if is_due and not progress.live.is_started:
             progress.start()
-        progress.advance(bar, count)
+        progress.advance(bars[name], count)
 
     try:
+        if not late:
+            progress.start()
         yield advance
     finally:
         if progress.live.is_started:
@@ -190,7 +185,7 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def check_names(kind: str, names: Iterable[str], known: Iterable[str], least: int = 0) -> None:
-    """Raises a ValueError for a name that is not registered, for one that is given twice, and where there is none and `least` is 1."""
+    """Raises a ValueError for a name that is not registered, for one given twice, and for fewer than `least`, 0 or 1."""
     names, known = list(names), list(known)
     if len(names) < least:
         raise ValueError(f"give at least one {kind}: {', '.join(known)}")
