@@ -189,11 +189,6 @@ def npz(arrays: Mapping[str, np.ndarray], compressed: bool = True) -> bytes:
     return buffer.getvalue()
 
 
-def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
-    """Writes arrays as a compressed .npz, the same bytes for the same arrays."""
-    return write(path, npz(arrays))
-
-
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Writes one line for each row under a line of column names, the keys of the first row.
 

@@ -176,7 +176,7 @@ class Trajectory(Moving):
         arrays = {"t": self.t, "x": self.x, "u": self.u}
         if self.xdot is not None:
             arrays["xdot"] = self.xdot
-        return files.write_npz(path, arrays)
+        return files.write(path, files.npz(arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":

@@ -170,7 +170,7 @@ class Forger:
             self.write(about={str(self.rng.choice(["regret_mean", "costs", "success"])): 0.0})
         else:
             name = str(self.rng.choice(["costs", "ends", "success"]))
-            files.write_npz(self.target, files.read_npz(self.path) | {name: np.zeros(EPISODES)})
+            files.write(self.target, files.npz(files.read_npz(self.path) | {name: np.zeros(EPISODES)}))
 
     def facts(self) -> None:
         wrong = [

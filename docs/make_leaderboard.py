@@ -8,13 +8,14 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import released
+
 from ballbot_gym import files
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.verify import regret
-from ballbot_train.evaluation import comparison, released
-from ballbot_train.evaluation.submissions import Entry, copies, read_entries
+from ballbot_train.evaluation import comparison
+from ballbot_train.evaluation.submissions import Entry, read_entries
 from ballbot_train.policy.files import shipped_ways
 from ballbot_train.work.console import markdown
 
@@ -49,7 +50,7 @@ def _table(entries: Sequence[Entry]) -> str:
     """Rows with fewer failures first, then those with less regret."""
     ranked = sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
     lines = [
-        [shown_name(entry), regret(entry), f"{round(len(entry.costs) * (1 - entry.success))}", str(group)]
+        [shown_name(entry), entry.shown_regret, f"{round(len(entry.costs) * (1 - entry.success))}", str(group)]
         for entry, group in zip(ranked, _groups(ranked), strict=True)
     ]
     # links in what was handed in are escaped; ours come after that
@@ -65,7 +66,7 @@ def _table(entries: Sequence[Entry]) -> str:
 
 def _whose_motion(entry: Entry, others: Sequence[Entry]) -> str:
     """A sentence if the motion is another row's or that of optima, else ""."""
-    of = [f"`{name}`" for name in copies(entry, others)]
+    of = [f"`{name}`" for name in entry.copies(others)]
     if entry.optima:
         of.append(f"the certified optimum in {entry.optima} of its episodes")
     return f"The motion of `{entry.name}` is that of {' and '.join(of)}, to 1e-6." if of else ""

@@ -282,7 +282,9 @@ def evaluation_set(**changes):
 
     def read(folder):
         arrays = files.read_npz(certified.path_of(make_task("turn"))) | changes
-        path = files.write_npz(folder / "set.npz", {name: part for name, part in arrays.items() if part is not None})
+        path = files.write(
+            folder / "set.npz", files.npz({name: part for name, part in arrays.items() if part is not None})
+        )
         return certified.load("turn", "paper", path)
 
     return read

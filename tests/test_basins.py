@@ -12,7 +12,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import ROBOTS, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train.evaluation import basins, runner
+from ballbot_train.evaluation import basins
 from ballbot_train.report import figures
 
 LEAN_RATE = 6  # its index in a state
@@ -58,56 +58,66 @@ def test_a_floor_that_lets_the_ball_slip_allows_less_lean_and_that_much_can_be_p
 
 @pytest.fixture
 def bounds():
-    """40° either way at every value."""
+    """37° either way at every value: the states at 37.5° are in doubt."""
     values = np.array([-15.0, 0.0, 15.0])
-    right = np.column_stack([np.full(3, 40.0), values])
+    right = np.column_stack([np.full(3, 37.0), values])
     return {name: np.concatenate([right, -right]) for name in basins.AXES}
 
 
 POINTS = 5
 
 
-def cells_and_results(bounds, recovered):
-    """All cells of all maps of 5 points, and results of LQR in which it recovers from some, (axis, i, j)."""
-    cells = {name: np.argwhere(np.ones((POINTS, POINTS))) for name in bounds}
-    results = [
-        certified_result(controller="lqr", episode=k, success=(name, i, j) in recovered, labels={"axis": name})
-        for name in bounds
-        for k, (i, j) in enumerate(cells[name].tolist())
-    ]
-    return cells, results, ["lqr"], POINTS
+@pytest.fixture
+def maps_of_lqr(bounds, monkeypatch, tmp_path):
+    """The maps of LQR, which recovers from some states (axis, value, lean in degrees), and the groups that were run."""
+    monkeypatch.setattr(basins.jobs, "run", lambda *_: [[{"boundary": each.tolist()}] for each in bounds.values()])
+
+    def maps(recovered):
+        ran = []
+
+        def run_groups(groups, *_):
+            ran.extend(groups)
+            for group in groups:
+                axis = group.labels["axis"]
+                for k, x in enumerate(group.starts):
+                    state = (axis, x[basins.AXES[axis].component], round(math.degrees(x[2]), 9))
+                    yield certified_result(controller="lqr", episode=k, success=state in recovered, labels=group.labels)
+
+        monkeypatch.setattr(basins.runner, "run_groups", run_groups)
+        return basins.run(["lqr"], POINTS, "rk4", tmp_path, 1), ran
+
+    return maps
 
 
-def test_only_states_that_may_be_recoverable_are_run_and_only_half_of_them(bounds):
-    cells = basins.cells_of(bounds, POINTS)["speed"]
-    assert {(i, j) for i, j in cells.tolist()} == {
-        (i, j) for i in (2, 3, 4) for j in (1, 2, 3)
-    }  # leans −75 to 75 by 37.5
+def test_only_states_that_may_be_recoverable_are_run_and_only_half_of_them(maps_of_lqr):
+    _, (group, _) = maps_of_lqr(set())
+    states = {(speed, round(math.degrees(lean), 9)) for lean, speed in group.starts[:, [2, 4]].tolist()}
+    assert states == {(speed, lean) for speed in (0.0, 7.5, 15.0) for lean in (-37.5, 0.0, 37.5)}
 
 
-def test_a_state_from_which_a_controller_recovers_is_recoverable(bounds):
-    found = {("speed", 2, 2), ("speed", 3, 4)}
-    basin = basins.maps_of(bounds, *cells_and_results(bounds, found))[0]
+def test_a_state_from_which_a_controller_recovers_is_recoverable(maps_of_lqr):
+    (basin, _), _ = maps_of_lqr({("speed", 0.0, 0.0), ("speed", 7.5, 37.5)})
     assert basin.recovered["lqr"].sum() == 3
-    assert basin.recovered["lqr"][3, 4]
-    assert basin.recovered["lqr"][1, 0]  # the same, turned by 180°
-    assert basin.recoverable.sum() == 15 + 2
-    assert basins.fraction([basin], "lqr") == pytest.approx(3 / 17)
+    assert basin.recovered["lqr"][3, 3]
+    assert basin.recovered["lqr"][1, 1]  # the same, turned by 180°
+    assert basin.recoverable.sum() == 5 + 2
+    assert basins.fraction([basin], "lqr") == pytest.approx(3 / 7)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_lqr_recovers_upright_and_slow_but_not_fast(robot, bounds, tmp_path):
-    cells = {"speed": basins.cells_of(bounds, 3)["speed"]}
-    done = runner.run_groups(basins.groups_of(cells, ["lqr"], 3, "rk4", robot), 0, tmp_path, 1)
-    recovered = {tuple(cells["speed"][result.episode].tolist()): result.success for result in done}
-    assert recovered == {(1, 1): True, (2, 1): False}  # 0 and 15 m/s
+def test_lqr_recovers_upright_and_slow_but_not_fast(robot, bounds, tmp_path, monkeypatch):
+    monkeypatch.setattr(basins, "AXES", {"speed": basins.AXES["speed"]})
+    run, boundaries = basins.jobs.run, [[[{"boundary": bounds["speed"].tolist()}]]]
+    monkeypatch.setattr(basins.jobs, "run", lambda *made: boundaries.pop() if boundaries else run(*made))
+    (basin,) = basins.run(["lqr"], 3, "rk4", tmp_path, 1, robot)
+    assert basin.recovered["lqr"][:, 1].tolist() == [False, True, False]  # −15, 0 and 15 m/s
 
 
-def test_maps_are_written_and_drawn(bounds, tmp_path):
-    maps = basins.maps_of(bounds, *cells_and_results(bounds, {("speed", 2, 2), ("lean rate", 2, 1)}))
+def test_maps_are_written_and_drawn(maps_of_lqr, tmp_path):
+    maps, _ = maps_of_lqr({("speed", 0.0, 0.0), ("lean rate", 0.0, -37.5)})
     basins.write(maps, {"commit": "none", "robot": "rolling"}, tmp_path)
     written = json.loads((tmp_path / "basins.json").read_text())
-    assert written["rows"][0]["recovered"] == pytest.approx(3 / 30)
+    assert written["rows"][0]["recovered"] == pytest.approx(3 / (5 + 7))
     assert [entry["recovered"] for entry in written["maps"]] == [
         {"lqr": basin.recovered["lqr"].astype(int).tolist()} for basin in maps
     ]

@@ -20,15 +20,14 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import ROBOTS, URDF_PATH, UrdfError, read_urdf, urdf_text
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train.commands.new import files_of
+from ballbot_train.commands.new import new
 from ballbot_train.evaluation import evaluate, optima
 
 
 @pytest.fixture
 def module(tmp_path, monkeypatch):
     """The name of a user's module, `ballbot_reach.py` in the folder of the test, which registers the task "reach"."""
-    for name, text in files_of("reach").items():
-        (tmp_path / name).write_text(text)
+    new("task", "reach", tmp_path, episodes=0)
     monkeypatch.syspath_prepend(tmp_path)
     return "ballbot_reach"
 

@@ -91,7 +91,7 @@ def test_a_set_may_grow_and_is_never_mixed_with_another(tmp_path):
 def test_a_shard_that_was_changed_is_named(tmp_path):
     url = str(tmp_path / "set")
     made(url, tmp_path / "out", 9)
-    files.write_npz(Path(url) / "shard-000001.npz", {"i": np.arange(3)})
+    files.write(Path(url) / "shard-000001.npz", files.npz({"i": np.arange(3)}))
     with pytest.raises(files.FileError, match=r"shard-000001\.npz is not the file that manifest\.json names"):
         list(shards.Shards(url))
 
@@ -197,7 +197,7 @@ def test_a_manifest_of_impossible_sizes_is_damaged(of, value, tmp_path):
 
 def test_a_shard_that_unpacks_to_far_more_than_it_holds_is_refused(tmp_path):
     made(str(tmp_path / "set"), tmp_path / "out", 5)
-    path = files.write_npz(tmp_path / "set" / "shard-000000.npz", {"i": np.zeros(2**24, np.uint8)})
+    path = files.write(tmp_path / "set" / "shard-000000.npz", files.npz({"i": np.zeros(2**24, np.uint8)}))
     assert path.stat().st_size < 2**15
     manifest = json.loads((tmp_path / "set" / shards.MANIFEST).read_text())
     manifest["shards"]["0"]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -21,7 +21,7 @@ from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train.commands.train import Run, command_with, parse
+from ballbot_train.commands.train import Run, command_line, command_with
 from ballbot_train.learning import apg, training
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS
@@ -205,7 +205,7 @@ def parsed(command):
     """Learner, options of the run and settings that a recorded command gives."""
     words, calls = shlex.split(command), []
     assert words[:2] == ["ballbot", "train"]
-    parse(words[2:], lambda *call: calls.append(call))
+    command_line(words[2:], lambda *call: calls.append(call[:-1]))
     return calls[0]
 
 
@@ -258,7 +258,7 @@ def test_help_lists_every_setting_with_the_defaults_of_the_task_and_on_demand_wh
     printed = {}
     for option in ("--help", "-H"):
         with pytest.raises(SystemExit):
-            parse([learner, "--task", "weave", option], lambda *call: None)
+            command_line([learner, "--task", "weave", option], lambda *call: None)
         printed[option] = capsys.readouterr().out
     settings = LEARNERS[learner].settings("weave")
     for field in fields(settings):

@@ -104,7 +104,7 @@ class EvaluationSet:
             "x": np.concatenate([trajectory.x for trajectory in trajectories]),
             "u": np.concatenate([trajectory.u for trajectory in trajectories]),
         }
-        return files.write_npz(path, arrays)
+        return files.write(path, files.npz(arrays))
 
 
 _PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "statuses", "drawn", "ideal")

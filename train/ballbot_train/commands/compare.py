@@ -1,10 +1,12 @@
 """`ballbot compare`: is one benchmark's result better than another's?"""
 
 from pathlib import Path
+from typing import Any
 
-from ballbot_train.evaluation import comparison
-from ballbot_train.evaluation.results import with_interval
-from ballbot_train.evaluation.submissions import read_run
+from ballbot_gym.engines import PHYSICS
+from ballbot_gym.robot import PAPER
+from ballbot_train.evaluation import comparison, submissions
+from ballbot_train.evaluation.results import Result, read_results, with_interval
 from ballbot_train.work.console import console, print_table
 
 
@@ -24,7 +26,7 @@ def compare(
         training_margin: between policies with different weights, smaller differences of success and regret decide nothing,
             because another training seed changes as much; 0.02 is 2 %. Between other controllers 0.1 % decides.
     """
-    runs = read_run(a), read_run(b)
+    runs = _read(a), _read(b)
     compared = comparison.compare(runs[0], runs[1], match, training_margin)
     for key in sorted(runs[0][0].keys() & runs[1][0].keys()):
         first, second = (run[0].get(key) for run in runs)
@@ -32,6 +34,24 @@ def compare(
             console.print(f"{key}: {first} in A, {second} in B")
     header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
     print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])
+
+
+def _read(source: Path) -> tuple[dict[str, Any], list[Result]]:
+    """`read_results` of a path, or the same of the leaderboard's rows of that name, with the paper's robot.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    if source.exists():
+        return read_results(source)
+    entries = [entry for entry in submissions.read_entries() if entry.robot == PAPER]
+    first = sorted(entries, key=lambda entry: list(PHYSICS).index(entry.physics), reverse=True)
+    chosen = {entry.task: entry for entry in first if entry.name == str(source)}.values()
+    if not chosen:
+        names = ", ".join(dict.fromkeys(entry.name for entry in entries))
+        raise ValueError(f"{source}: no such file or folder, and no row of the leaderboard, which has {names}")
+    policies = {f"{entry.task}/{entry.name}": entry.policy for entry in chosen if entry.policy}
+    return {"policies": policies}, [result for entry in chosen for result in entry.results()]
 
 
 def _cells(entry: comparison.Comparison) -> list[str]:

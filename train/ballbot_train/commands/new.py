@@ -17,6 +17,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.results import TABLE, table_cells
 from ballbot_train.work.console import check_least, console, markdown, physics_or_default
+from ballbot_train.work.templates import render
 
 _TEMPLATES = Path(__file__).parent / "template"
 _FIRST = ("lqr", "trajopt")
@@ -37,8 +38,8 @@ def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: 
     check_least(0, episodes=episodes)
     if name in TASKS or _id_of(name) in gymnasium.registry or _module_of(name) in _OURS:
         raise ValueError(f"there is a task {name!r} already, or a package of ours of that name; give another name")
-    texts = files_of(name)
-    if (called := kind_of(name)) in _names_in(texts[f"{_module_of(name)}.py"]):
+    texts = _files_of(name)
+    if (called := _kind_of(name)) in _names_in(texts[f"{_module_of(name)}.py"]):
         raise ValueError(f"the task's class would be {called!r}, which means something else there; give another name")
     out = Path(name) if out is None else out
     if there := [path for path in (*texts, "leaderboard.md") if (out / path).exists()]:
@@ -50,22 +51,17 @@ def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: 
     console.print(f"made: {out}\nwhat to do next: {out / 'README.md'}")
 
 
-def files_of(name: str) -> dict[str, str]:
+def _files_of(name: str) -> dict[str, str]:
     """The files of a task's package by their names, as text."""
-    import jinja2  # no other command needs it
-
     module = _module_of(name)
-    values = {"name": name, "kind": kind_of(name), "module": module, "id": _id_of(name)}
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATES), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
-    )
+    values = {"name": name, "kind": _kind_of(name), "module": module, "id": _id_of(name)}
     templates = {
         "pyproject.toml": "pyproject.toml",
         f"{module}.py": "task.py",
         f"test_{module}.py": "test_task.py",
         "README.md": "README.md",
     }
-    return {path: environment.get_template(f"{template}.j2").render(values) for path, template in templates.items()}
+    return {path: str(render(_TEMPLATES / f"{template}.j2", **values)) for path, template in templates.items()}
 
 
 def _module_of(name: str) -> str:
@@ -73,14 +69,14 @@ def _module_of(name: str) -> str:
     return f"ballbot_{name}"
 
 
-def kind_of(name: str) -> str:
+def _kind_of(name: str) -> str:
     """The class of a task's package."""
     return "".join(part.capitalize() for part in name.split("_"))
 
 
 def _id_of(name: str) -> str:
     """The Gymnasium id of a task's package."""
-    return f"Ballbot{kind_of(name)}-v0"
+    return f"Ballbot{_kind_of(name)}-v0"
 
 
 def _names_in(source: str) -> set[str]:

@@ -14,7 +14,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import UNNAMED
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.settings import check_ranges, number
+from ballbot_train.learning.settings import Settings, number
 from ballbot_train.work.console import RobotName, check_names, console, option, physics_or_default
 from ballbot_train.work.executors import Workers
 
@@ -25,7 +25,7 @@ _RENAMED = {
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(Settings):
     """Options of a run that every learner has."""
 
     task: str = "stabilize"
@@ -72,7 +72,7 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
     """
     _check_learner(learner)
     check_names("task", [run.task], TASKS)
-    check_ranges(run)
+    run.check()
     if run.out is None:
         run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")
     settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
@@ -147,21 +147,15 @@ def _share(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.2%}"
 
 
-def command_line(arguments: Sequence[str]) -> None:
-    """Runs what was typed after `ballbot train`."""
-    words = ["ballbot", "train", *(word for word in arguments if word != "--resume")]
-    parse(arguments, lambda learner, run, settings: train(learner, run, settings, shlex.join(words)))
-
-
-def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> None:
-    """Parses what was typed after `ballbot train`.
+def command_line(arguments: Sequence[str], call: Callable[[str, Run, Any, str], None] = train) -> None:
+    """Runs what was typed after `ballbot train`.
 
     Only the file of the learner that is named is imported. Its options are the fields of its settings, and their defaults
     are the settings tuned for the task that is named, with or without demonstrations or a policy to start from.
 
     Args:
         arguments: the words.
-        call: called with the learner's name, the options of the run, and the learner's settings.
+        call: what is run, with the learner's name, the options of the run, the learner's settings, and the command.
 
     Raises:
         ValueError: the learner or the task does not exist.
@@ -191,8 +185,10 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     check_names("task", [known.task], TASKS)
     settings = LEARNERS[named].settings(known.task, {known.demos, known.start} - {None, "None"} != set())
 
+    words = ["ballbot", "train", *(word for word in arguments if word != "--resume")]
+
     def command(run: Any = Run(), settings: Any = settings) -> None:
-        call(named, run, settings)
+        call(named, run, settings, shlex.join(words))
 
     # options are --task and --num-envs, and not --run.task and --settings.num-envs
     command.__annotations__ = {"run": Annotated[Run, UNNAMED], "settings": Annotated[type(settings), UNNAMED]}

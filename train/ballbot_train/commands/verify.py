@@ -1,11 +1,9 @@
 """`ballbot verify`: the leaderboard row of a submission, computed from its motion alone."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from ballbot_train.evaluation import submissions
-from ballbot_train.evaluation.results import with_interval
 from ballbot_train.work.console import console, print_rows
 
 
@@ -44,21 +42,14 @@ def print_entries(entries: Sequence[submissions.Entry]) -> None:
                     "physics": entry.physics,
                     "success": f"{entry.success:.1%}",
                     "falls": f"{entry.falls}/{len(entry.costs)}",
-                    "regret mean": regret(entry),
+                    "regret mean": entry.shown_regret,
                 }
                 for entry in entries
             ],
         )
     known = submissions.read_entries() if entries else []
     for entry in entries:
-        if of := submissions.copies(entry, known):
+        if of := entry.copies(known):
             console.print(f"{entry.name}: the costs are those of {', '.join(of)} to 1e-6; is it the same motion?")
         if entry.optima:
             console.print(f"{entry.name}: {entry.optima} episodes are the certified optimal motions to 1e-6")
-
-
-def regret(entry: submissions.Entry) -> str:
-    """The mean regret of a row with its interval, %; a dash where every episode failed."""
-    numbers = entry.regret_mean, entry.regret_low, entry.regret_high
-    mean, low, high = (math.nan if value is None else value for value in numbers)
-    return with_interval(mean, low, high)

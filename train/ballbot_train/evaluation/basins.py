@@ -72,16 +72,16 @@ def run(
     search = [jobs.Job(f"boundary-{name}", _boundary, (robot,), (name,), "boundary") for name in AXES]
     found = jobs.run(search, out, workers)
     bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
-    cells = cells_of(bounds, points)
-    results = runner.run_groups(groups_of(cells, controllers, points, physics, robot), 0, out, workers)
-    return maps_of(bounds, cells, results, controllers, points)
+    cells = _cells_of(bounds, points)
+    results = runner.run_groups(_groups_of(cells, controllers, points, physics, robot), 0, out, workers)
+    return _maps_of(bounds, cells, results, controllers, points)
 
 
 def _boundary(robot: str, names: Sequence[str]) -> Iterator[jobs.Entry]:
     from ballbot_baselines.optimum.recovery import largest_leans  # it imports CasADi
 
     for name in names:
-        values = grid(name, _BOUNDARY_POINTS)[1]
+        values = _grid(name, _BOUNDARY_POINTS)[1]
         highest = np.degrees(largest_leans(make_task(TASK, robot), named_robot(robot), AXES[name].component, values))
         known = np.isfinite(highest)
         right = np.column_stack([highest, values])[known]
@@ -97,27 +97,27 @@ def _within(boundary: np.ndarray, leans: np.ndarray, values: np.ndarray, doubt: 
     return (leans >= lowest[:, None] - doubt) & (leans <= highest[:, None] + doubt)
 
 
-def grid(axis: str, points: int) -> tuple[np.ndarray, np.ndarray]:
+def _grid(axis: str, points: int) -> tuple[np.ndarray, np.ndarray]:
     """Leans (points,), degrees, and values (points,) of the axis."""
     limit = AXES[axis].limit
     return np.linspace(-LEAN_LIMIT, LEAN_LIMIT, points), np.linspace(-limit, limit, points)
 
 
-def cells_of(bounds: Mapping[str, np.ndarray], points: int) -> dict[str, np.ndarray]:
+def _cells_of(bounds: Mapping[str, np.ndarray], points: int) -> dict[str, np.ndarray]:
     """The states to run, as (n, 2) rows and columns of each map: those within the boundaries or little beyond, of half a
     map.
     """
-    worth = {name: _within(boundary, *grid(name, points), _DOUBT) for name, boundary in bounds.items()}
+    worth = {name: _within(boundary, *_grid(name, points), _DOUBT) for name, boundary in bounds.items()}
     return {name: np.argwhere(inside & (np.arange(points) >= points // 2)[:, None]) for name, inside in worth.items()}
 
 
-def groups_of(
+def _groups_of(
     cells: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str, robot: str = PAPER
 ) -> list[runner.Group]:
     """What to run, for `run_groups`: every controller from all states of each map. Results are labelled with their "axis"."""
     groups = []
     for name, chosen in cells.items():
-        leans, values = grid(name, points)
+        leans, values = _grid(name, points)
         starts = np.zeros((len(chosen), named_robot(robot).state_size))
         starts[:, AXES[name].component], starts[:, 2] = values[chosen[:, 0]], np.radians(leans[chosen[:, 1]])
         world: dict[str, Any] = {"starts": starts, "fields": {"arena_radius": _ARENA_RADIUS}, "labels": {"axis": name}}
@@ -125,7 +125,7 @@ def groups_of(
     return groups
 
 
-def maps_of(
+def _maps_of(
     bounds: Mapping[str, np.ndarray],
     cells: Mapping[str, np.ndarray],
     results: Iterable[Result],
@@ -141,7 +141,7 @@ def maps_of(
         found[-1 - i, -1 - j] |= result.success
     maps = []
     for name, boundary in bounds.items():
-        leans, values = grid(name, points)
+        leans, values = _grid(name, points)
         recoverable = np.logical_or.reduce([_within(boundary, leans, values), *recovered[name].values()])
         maps.append(BasinMap(name, leans, values, boundary, recoverable, recovered[name]))
     return maps

@@ -22,7 +22,7 @@ rolls without slipping, which honest motions in grip keep within 1e-5. A ball th
 SLIP_TOLERANCE = 1e-3
 """Largest slip of a rolling ball after a step, m/s. Honest motions in grip keep within 5e-5."""
 STEERED = 1e-4
-"""The part of an episode's cost that the errors of all its steps may have changed, see `steering.steered`. Honest motions
+"""The part of an episode's cost that the errors of all its steps may have changed, see `_check_errors`. Honest motions
 keep within 1e-5."""
 
 SUCCESS, MISSED, NO_PLAN = "success", "missed", "no plan"
@@ -113,7 +113,8 @@ def _check_errors(
     for i in np.flatnonzero(steps.lengths):
         n, first, end = steps.lengths[i], steps.first[i], ends[i]
         moved = steps.states[first : first + n + 1], steps.action[end - n : end]
-        part = steering.steered(task, robot, *moved, known.constants[i], error[end - n : end]) / cost[i]
+        slopes = steering.costates(task, robot, *moved, known.constants[i])
+        part = float(np.abs(slopes * error[end - n : end]).sum()) / cost[i]
         if not part <= STEERED:
             raise SubmissionError(
                 f"{steps.path}: episode {i}: the small errors of its steps together may have changed its cost by {part:.2%}, "

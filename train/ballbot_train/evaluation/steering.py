@@ -16,8 +16,8 @@ from ballbot_gym.tasks import Task
 _H = 1e-5  # m, rad and per second, of finite differences
 
 
-def steered(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.ndarray, error: np.ndarray) -> float:
-    """Bounds what errors changed in an episode's cost: the sum of |costate · error| over steps and components of the state.
+def costates(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """The slopes (n, 8) of an episode's cost with respect to the state after each step.
 
     Args:
         task: the task.
@@ -25,13 +25,6 @@ def steered(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.n
         x: (n+1, 8) recorded states.
         action: (n, 2) recorded actions.
         c: (nc,) constants of the episode.
-        error: (n, 8) recorded states less those that the engine gives, after each step.
-    """
-    return float(np.abs(costates(task, robot, x, action, c) * error).sum())
-
-
-def costates(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The slopes (n, 8) of an episode's cost with respect to the state after each step; for the arguments see `steered`.
 
     After a deviation time-varying LQR steers back to the motion. Along an optimum the slopes do not depend on the
     feedback. Without feedback they would grow as fast as the robot falls.

@@ -22,12 +22,12 @@ from ballbot_gym import certified, files
 from ballbot_gym.certified import version
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, ROBOTS, named_robot
+from ballbot_gym.robot import ROBOTS, named_robot
 from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError, judged
-from ballbot_train.evaluation.results import Result, leaderboard, read_results, to_json
+from ballbot_train.evaluation.results import Result, leaderboard, to_json, with_interval
 
 LEAST_REGRET = {"rk4": (-1e-3, -1e-4), "bullet": (-0.01, -0.002), "mujoco": (-0.01, -0.002)}
 """Of an episode, and of the mean of a row: what the engine's difference from the optimum's closed form explains."""
@@ -100,6 +100,47 @@ class Entry:
             for i, (cost, end) in enumerate(zip(self.costs, self.ends, strict=True))
         ]
 
+    def summary(self) -> dict[str, Any]:
+        """The fields that follow from its episodes."""
+        (row,) = leaderboard(self.results())
+        regrets = {name: getattr(row, name) for name in ("regret_mean", "regret_low", "regret_high", "regret_median")}
+        shown = {name: float(f"{value:.6g}") if math.isfinite(value) else None for name, value in regrets.items()}
+        return {"success": row.success, "falls": row.falls, **shown}
+
+    def too_good(self) -> str:
+        """Why no controller can have earned it, "" if one can: it beats optima by more than its engine's difference."""
+        of_episode, of_mean = LEAST_REGRET[self.physics]
+        regrets = [result.cost / result.optimum - 1 if result.success else 0.0 for result in self.results()]
+        worst = min(range(len(regrets)), key=regrets.__getitem__)
+        where, regret, least = f"episode {worst}", regrets[worst], of_episode
+        if regret >= least:
+            where, regret, least = "the mean of all episodes", self.regret_mean or 0.0, of_mean
+        if regret >= least:
+            return ""
+        return (
+            f"{where} costs {-regret:.3%} less than the optimum, and {self.physics} explains at most {-least:.3%}. "
+            "If you found a better optimum, open an issue with the recording"
+        )
+
+    def copies(self, others: Iterable["Entry"]) -> list[str]:
+        """Names of the rows whose motions these are, as far as costs tell: half of the episodes or more agree to 1e-6."""
+        same = []
+        for other in others:
+            board = (other.task, other.robot, other.physics) == (self.task, self.robot, self.physics)
+            if board and other.name != self.name and len(other.costs) == len(self.costs):
+                near = np.isclose(self.costs, other.costs, rtol=1e-6, atol=0)
+                moved = np.array(self.ends) != NO_PLAN
+                if 2 * np.count_nonzero(near & moved & (np.array(self.ends) == other.ends)) >= len(near):
+                    same.append(other.name)
+        return same
+
+    @property
+    def shown_regret(self) -> str:
+        """The mean regret with its interval, %; a dash where every episode failed."""
+        numbers = self.regret_mean, self.regret_low, self.regret_high
+        mean, low, high = (math.nan if value is None else value for value in numbers)
+        return with_interval(mean, low, high)
+
     @property
     def file(self) -> str:
         """Name of its file."""
@@ -155,24 +196,6 @@ def _wrong_row(entry: Entry) -> str:
     known = {SUCCESS, MISSED, NO_PLAN, *limit_names(make_task(entry.task, entry.robot), named_robot(entry.robot))}
     unknown = [end for end in ends if end not in known]
     return f"unknown end {unknown[0]!r}; known: {', '.join(sorted(known))}" if unknown else ""
-
-
-def read_run(source: Path) -> tuple[dict[str, Any], list[Result]]:
-    """`read_results` of a path, or the same of the leaderboard's rows of that name, with the paper's robot.
-
-    Raises:
-        ValueError: there is neither.
-    """
-    if source.exists():
-        return read_results(source)
-    entries = [entry for entry in read_entries() if entry.robot == PAPER]
-    first = sorted(entries, key=lambda entry: list(PHYSICS).index(entry.physics), reverse=True)
-    chosen = {entry.task: entry for entry in first if entry.name == str(source)}.values()
-    if not chosen:
-        names = ", ".join(dict.fromkeys(entry.name for entry in entries))
-        raise ValueError(f"{source}: no such file or folder, and no row of the leaderboard, which has {names}")
-    policies = {f"{entry.task}/{entry.name}": entry.policy for entry in chosen if entry.policy}
-    return {"policies": policies}, [result for entry in chosen for result in entry.results()]
 
 
 def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str, bytes]:
@@ -240,39 +263,10 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
     rounded = [float(f"{cost:.9g}") for cost in costs]  # more digits differ between machines
     digest = hashlib.sha256(content).hexdigest()
     entry = Entry(**{key: facts[key] for key in _FACTS}, submission=digest, costs=rounded, ends=ends)
-    entry = replace(entry, **summary(entry), steered=STEERED, optima=_optimal_motions(steps, known))
-    if why := too_good(entry):
+    entry = replace(entry, **entry.summary(), steered=STEERED, optima=_optimal_motions(steps, known))
+    if why := entry.too_good():
         raise SubmissionError(f"{path}: {why}")
     return entry
-
-
-def too_good(entry: Entry) -> str:
-    """Why no controller can have earned a row, "" if one can: it beats optima by more than its engine's difference."""
-    of_episode, of_mean = LEAST_REGRET[entry.physics]
-    regrets = [result.cost / result.optimum - 1 if result.success else 0.0 for result in entry.results()]
-    worst = min(range(len(regrets)), key=regrets.__getitem__)
-    where, regret, least = f"episode {worst}", regrets[worst], of_episode
-    if regret >= least:
-        where, regret, least = "the mean of all episodes", entry.regret_mean or 0.0, of_mean
-    if regret >= least:
-        return ""
-    return (
-        f"{where} costs {-regret:.3%} less than the optimum, and {entry.physics} explains at most {-least:.3%}. "
-        "If you found a better optimum, open an issue with the recording"
-    )
-
-
-def copies(entry: Entry, others: Iterable[Entry]) -> list[str]:
-    """Names of the rows whose motions these are, as far as costs tell: half of the episodes or more agree to 1e-6."""
-    same = []
-    for other in others:
-        board = (other.task, other.robot, other.physics) == (entry.task, entry.robot, entry.physics)
-        if board and other.name != entry.name and len(other.costs) == len(entry.costs):
-            near = np.isclose(entry.costs, other.costs, rtol=1e-6, atol=0)
-            moved = np.array(entry.ends) != NO_PLAN
-            if 2 * np.count_nonzero(near & moved & (np.array(entry.ends) == other.ends)) >= len(near):
-                same.append(other.name)
-    return same
 
 
 def _optimal_motions(steps: Steps, known: certified.EvaluationSet) -> int:
@@ -281,14 +275,6 @@ def _optimal_motions(steps: Steps, known: certified.EvaluationSet) -> int:
         states = steps.states[first : first + n + 1]
         count += states.shape == trajectory.x.shape and bool(np.abs(states - trajectory.x).max() <= 1e-6)
     return count
-
-
-def summary(entry: Entry) -> dict[str, Any]:
-    """The fields of a row that follow from its episodes."""
-    (row,) = leaderboard(entry.results())
-    regrets = {name: getattr(row, name) for name in ("regret_mean", "regret_low", "regret_high", "regret_median")}
-    shown = {name: float(f"{value:.6g}") if math.isfinite(value) else None for name, value in regrets.items()}
-    return {"success": row.success, "falls": row.falls, **shown}
 
 
 _FACTS = ("name", "link", "task", "robot", "physics", "policy", "versions")

@@ -25,15 +25,6 @@ def number(default: Any, least: float = -math.inf, most: float = math.inf, above
     return field(default=default, metadata={"least": least, "most": most, "above": above})
 
 
-def check_ranges(instance: Any) -> None:
-    """Raises a ValueError that names the first field of a dataclass whose number is out of its range."""
-    for each in fields(instance):
-        if each.metadata:
-            value = getattr(instance, each.name)
-            for one in value if isinstance(value, tuple) else [value]:
-                _check(each.name, one, **each.metadata)
-
-
 def _check(name: str, value: float, least: float, most: float, above: float | None) -> None:
     finite = isinstance(value, int) or math.isfinite(value)
     if finite and least <= value <= most and (above is None or value > above):
@@ -58,8 +49,12 @@ def check_memory(num_envs: int, steps: int) -> None:
 
 @dataclass(frozen=True)
 class Settings:
-    """Base class of the learners' settings."""
+    """Base class of settings, the learners' among them."""
 
     def check(self) -> None:
         """Raises a ValueError that names the first setting that makes no sense."""
-        check_ranges(self)
+        for each in fields(self):
+            if each.metadata:
+                value = getattr(self, each.name)
+                for one in value if isinstance(value, tuple) else [value]:
+                    _check(each.name, one, **each.metadata)

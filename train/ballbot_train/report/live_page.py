@@ -33,7 +33,7 @@ _GHOSTS, _HIDDEN = "Ghosts", "Changes hidden from the controllers"
 
 
 @dataclass(frozen=True)
-class Control:
+class _Control:
     """Something that a page can change, by its name."""
 
     name: str
@@ -92,7 +92,7 @@ class PlayPage:
         self.speed = 1.0
         self._asked: dict[str, Any] = {}  # by the name of a control, the last value that a page has requested
         self._lock = threading.Lock()  # of that
-        self._controls: dict[str, Control] = {}
+        self._controls: dict[str, _Control] = {}
         self._next_text = 0.0
         playground.announce = self._announce
         self._refresh()
@@ -152,26 +152,26 @@ class PlayPage:
 
     # --- controls ---
 
-    def _made_controls(self) -> list[Control]:
+    def _made_controls(self) -> list[_Control]:
         playground, known = self.playground, tuple(self.playground.world.controllers)
         episodes: dict[str, Start] = {"rest": "rest", "random": "random"}
         if playground.world.certified is not None:
             episodes |= {str(i): i for i in range(certified.EPISODES)}
         return [
-            Control("Task", playground.set_world, lambda: playground.world.task_name, tuple(TASKS)),
-            Control("Robot", lambda to: playground.set_world(robot=to), lambda: playground.world.robot, tuple(ROBOTS)),
-            Control("Controller", playground.set_controller, lambda: playground.main.name, known),
-            Control(
+            _Control("Task", playground.set_world, lambda: playground.world.task_name, tuple(TASKS)),
+            _Control("Robot", lambda to: playground.set_world(robot=to), lambda: playground.world.robot, tuple(ROBOTS)),
+            _Control("Controller", playground.set_controller, lambda: playground.main.name, known),
+            _Control(
                 "Episode", lambda to: playground.begin(episodes[to]), lambda: str(playground.episode), tuple(episodes)
             ),
             *(
-                Control(
+                _Control(
                     name, partial(self._set_ghost, name), partial(playground.ghosts.__contains__, name), group=_GHOSTS
                 )
                 for name in known
             ),
             *(
-                Control(
+                _Control(
                     stress.label,
                     partial(playground.set_plant, name),
                     partial(playground.plant.get, name),
@@ -180,16 +180,16 @@ class PlayPage:
                 )
                 for name, stress in STRESSES.items()
             ),
-            Control("Set all to 0", lambda _: self._reset_plant(), group=_HIDDEN),
+            _Control("Set all to 0", lambda _: self._reset_plant(), group=_HIDDEN),
         ]
 
     def _refresh(self) -> None:
         """Shows what holds now, in every control and in words."""
         shown = self._made_controls()
         hidden = [
-            Control("playing", self._set_playing, lambda: not self.paused),
-            Control("speed", partial(setattr, self, "speed"), lambda: self.speed, limits=_SPEEDS),
-            Control("Restart", lambda _: self.playground.restart()),
+            _Control("playing", self._set_playing, lambda: not self.paused),
+            _Control("speed", partial(setattr, self, "speed"), lambda: self.speed, limits=_SPEEDS),
+            _Control("Restart", lambda _: self.playground.restart()),
             _Push("push", lambda impulse: self.playground.push(*impulse)),
         ]  # stream.js shows these in other places than the panel
         with self._lock:
@@ -246,7 +246,7 @@ class PlayPage:
         }
 
 
-class _Push(Control):
+class _Push(_Control):
     """A push, which the page makes of a drag."""
 
     def checked(self, value: Any) -> Any:

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from ballbot_gym import files
 from ballbot_gym.drawing import page
 from ballbot_train.report.replay import Replay, Take
-from ballbot_train.work import templates
+from ballbot_train.work.templates import render
 
 _ASSETS = Path(__file__).parent / "assets"
 _REPLAY_DT = 0.02  # s, between the states in the page
@@ -42,7 +42,7 @@ def report_page(
     """
     episodes = [_episode_data(replay) for replay in replays if replay.takes]
     text = render(
-        "page.html.j2",
+        _ASSETS / "page.html.j2",
         title=title,
         header=header,
         rows=rows,
@@ -56,11 +56,6 @@ def report_page(
         scripts=[asset("table.js"), Markup(page.asset("scene.js")), asset("replay.js")],
     )
     return str(text)
-
-
-def render(template: str, **values: object) -> Markup:
-    """A template of `assets/` with these values."""
-    return templates.render(_ASSETS / template, **values)
 
 
 def asset(name: str) -> Markup:

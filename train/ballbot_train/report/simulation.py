@@ -46,7 +46,7 @@ def severities(stress: str) -> tuple[float, float, float]:
     return 2 * min(0.0, *levels), 2 * max(levels), min(map(abs, levels))
 
 
-class World:
+class _World:
     """A task for a robot, and what can be chosen there."""
 
     def __init__(self, task: str, robot: str):
@@ -145,7 +145,7 @@ class Runner:
         self.arrived = terminated and info["success"]
 
 
-class Score(NamedTuple):
+class _Score(NamedTuple):
     """How an episode of the main robot ended."""
 
     controller: str
@@ -188,7 +188,7 @@ class Playground:
         Args:
             task: name of a task.
             controller: of the main robot: an expert, a policy that comes with the package, or the path of a policy file or
-                of a model that Stable-Baselines3 saved; default, `World.best`.
+                of a model that Stable-Baselines3 saved; default, the shipped policy with the least regret, or else NMPC.
             ghosts: controllers of the ghosts.
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
             episode: see `begin`.
@@ -201,7 +201,7 @@ class Playground:
         """
         self.announce: Callable[[str], object] = lambda text: None
         """Is called with a sentence before something that may take long."""
-        self.scores: list[Score] = []
+        self.scores: list[_Score] = []
         """Of the main robot's episodes."""
         self.plant = dict.fromkeys(STRESSES, 0.0)
         """Severity of each hidden change."""
@@ -213,7 +213,7 @@ class Playground:
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
         self._physics = default_physics() if physics is None else physics
-        world = World(task, robot)
+        world = _World(task, robot)
         self._open(world, [world.best if controller is None else controller, *ghosts])
         self.begin("random" if world.certified is None and episode != "rest" else episode)
 
@@ -318,7 +318,7 @@ class Playground:
 
     def set_world(self, task: str | None = None, robot: str | None = None) -> None:
         """Another task, or another robot, under the same controllers where they are made for it."""
-        world = World(task or self.world.task_name, robot or self.world.robot)
+        world = _World(task or self.world.task_name, robot or self.world.robot)
         main = self.main.name if self.main.name in world.controllers else world.best
         self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)])
         self.begin("random" if world.certified is None else 0)
@@ -376,13 +376,13 @@ class Playground:
 
     # --- inside ---
 
-    def _open(self, world: World, controllers: Iterable[str]) -> None:
+    def _open(self, world: _World, controllers: Iterable[str]) -> None:
         made = [(name, self._made(name, world)) for name in controllers]
         self.close()
         self.world = world
         self.runners = [Runner(*each, self._env(world)) for each in made]
 
-    def _made(self, name: str, world: World) -> Controller:
+    def _made(self, name: str, world: _World) -> Controller:
         """A controller by name, which is offered from then on."""
         self.announce(f"preparing {labels.label(name)} … the first time in a task, solvers are compiled")
         controller = make_controller(name, world.task, world.params)
@@ -406,7 +406,7 @@ class Playground:
                 runner.name, runner.controller = "lqr", make_controller("lqr", self.world.task, self.world.params)
                 runner.controller.reset(0.0, *map(np.array, start))
 
-    def _env(self, world: World) -> BallbotEnv:
+    def _env(self, world: _World) -> BallbotEnv:
         """With what the controllers do not know: the true robot, its actuator, sensors and pushes.
 
         Changes by hand take the track's place.
@@ -422,7 +422,7 @@ class Playground:
         """Notes the score. The same episode begins again after a pause; if only time is over, another where the robot is."""
         task, main = self.world.task, self.main
         regret = main.cost / self.optimum_cost - 1
-        self.scores.append(Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated))
+        self.scores.append(_Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated))
         if task.first_exit or main.stands_still:
             self._pause_left = round(_PAUSE / task.control_dt)
         else:

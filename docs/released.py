@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ballbot_gym import certified, files
 from ballbot_gym.tasks.identity import digest
-from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries, summary, too_good, verify
+from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries, verify
 
 LIST = "released.txt"
 _VERIFIED = (
@@ -102,9 +102,9 @@ def _unbacked(entry: Entry, submission: Path | None, released: dict[str, str], e
     """Why a row is not accepted; "" if it is. Its submission is verified again, if there is one."""
     if len(entry.costs) != episodes:
         return f"it has {len(entry.costs)} episodes, and not {episodes}"
-    if any(getattr(entry, name) != value for name, value in summary(entry).items()):
+    if any(getattr(entry, name) != value for name, value in entry.summary().items()):
         return "its success, falls or regret are not those of its episodes"
-    if why := too_good(entry):
+    if why := entry.too_good():
         return why
     if submission is not None:
         try:
