@@ -256,7 +256,7 @@ def _acting(policy: Any, task: Task, params: Robot) -> Controller:
     if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
         return policy
     if callable(getattr(policy, "predict", None)):
-        predictor = _Predictor(policy, task, params)
+        predictor = Predictor(policy, task, params)
         return ActionController(task, params, predictor, predictor.history)
     torch: Any = sys.modules.get("torch")
     if torch is not None and isinstance(policy, torch.nn.Module):
@@ -286,7 +286,7 @@ def _module_actions(module: Any) -> Callable[[np.ndarray, bool], np.ndarray]:
     return actions
 
 
-class _Predictor:
+class Predictor:
     """The deterministic actions (..., 2) of an SB3 model, or of another object with `predict`.
 
     Observations (..., no) are of an episode, or of one episode per env.
