@@ -12,6 +12,8 @@ import pytest
 pytest.importorskip("casadi")
 
 from ballbot_baselines import Optimum, find_optima, find_optimum
+from ballbot_baselines.optimum.batched import multistart, search_many
+from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym import certified, machine_code, ops
 from ballbot_gym.robot import substeps_for
 from ballbot_gym.rollout import PlanError
@@ -113,6 +115,24 @@ def test_a_second_search_finds_what_the_first_one_misses(name, episode, params):
     assert once.cost > 1.01 * twice.cost
     assert twice.is_optimal
     assert twice.cost == pytest.approx(known.costs[episode], rel=1e-6)
+
+
+def test_random_guesses_cost_no_more_and_depend_on_the_episode_alone(params):
+    known, task = certified.load("weave", "paper"), TASKS["weave"]()
+    x0, c = known.states[:3], known.constants[:3]
+    more = costs_of(search_many(task, params, x0, c, Backoff(), slalom_guesses=8))
+    assert (more <= costs_of(search_many(task, params, x0, c, Backoff()))).all()
+    alone = search_many(task, params, x0[1:2], c[1:2], Backoff(), slalom_guesses=8)
+    assert costs_of(alone)[0] == more[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_random_guesses_reach_certified_optima_and_nothing_cheaper(name, params):
+    known, task = certified.load(name, "paper"), TASKS[name]()
+    found, costs = multistart(task, params, known.states[:8], known.constants[:8], 48)
+    assert (costs_of(found) > known.costs[:8] * (1 - 1e-4)).all()
+    assert ((costs / known.costs[:8]).min(axis=0) < 1 + 1e-3).mean() >= 0.75
 
 
 def test_they_are_episodes_of_the_closed_form_that_obey_every_constraint(drawn, params):

@@ -20,13 +20,16 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
-from ballbot_baselines.optimum import sides
+from ballbot_baselines.optimum import random_guesses, sides
 from ballbot_baselines.optimum.guesses import BASIN_DOUBT, COARSE, CONSIDERED, contenders, side_doubt, straight_path
 from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.optimum.random_guesses import Recovery
 from ballbot_baselines.solvers import guess, righting
+from ballbot_baselines.solvers.compiled import LANES
 from ballbot_baselines.solvers.ilqr import MARGIN, Motions, Options, ilqr
 from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
 from ballbot_gym import machine_code
@@ -64,12 +67,17 @@ _AT_REST = 1e-5  # relative to an episode's cost: how wrong LQR's cost-to-go may
 _SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
 _FEW = 16  # problems
 _AT_ONCE = 256  # episodes in memory
+_ENOUGH = 16  # solutions from random guesses
+_HOPELESS = 64  # random guesses without a solution, after which an episode is left
 
 
 def search_many(
-    task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff
+    task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, slalom_guesses: int = 0
 ) -> list[Optimum | None] | None:
     """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
+
+    Slaloms are searched from up to `slalom_guesses` random guesses, too. The other tasks' searches miss nothing that random
+    guesses find; `benchmarks/multistart.py` counts it.
 
     There is no list where episodes cannot be searched together: C code cannot be compiled here, it lacks an operation of the
     task, the task has a clock, or the robot has wheels.
@@ -78,7 +86,25 @@ def search_many(
         return None
     backoff = replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal))
     parts = [slice(first, first + _AT_ONCE) for first in range(0, len(x0), _AT_ONCE)]
-    return [optimum for some in parts for optimum in _Batch(task, params, x0[some], c[some], backoff).optima()]
+    found: list[Optimum | None] = []
+    for some in parts:
+        batch = _Batch(task, params, x0[some], c[some], backoff)
+        batch.search(slalom_guesses if batch.is_slalom else 0, _ENOUGH)
+        found += batch.optima()
+    return found
+
+
+def multistart(
+    task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, guesses: int
+) -> tuple[list[Optimum | None], np.ndarray]:
+    """Searches B episodes from random guesses, too; arguments as in `search_many`.
+
+    Returns:
+        The optima, and costs (guesses, B) to which the random guesses led; infinite where one led to no solution.
+    """
+    batch = _Batch(task, params, x0, c, Backoff(margin=MARGIN, goal=MARGIN))
+    costs = batch.search(guesses)
+    return batch.optima(), costs
 
 
 def _solves(task: Task, params: Robot) -> bool:
@@ -89,13 +115,23 @@ def _solves(task: Task, params: Robot) -> bool:
     return True
 
 
+class _Known(NamedTuple):
+    """A motion of an episode that was found before random guesses are tried."""
+
+    path: np.ndarray
+    """(n+1, 2) on the ground, m."""
+    rough_cost: float
+    """Of a slalom, with forces held longer; infinite if that is not known."""
+
+
 class _Batch:
     """The search of some episodes."""
 
     def __init__(self, task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff):
         self._task, self._params, self._x0, self._c, self._backoff = task, params, x0, c, backoff
         self._solver = ilqr(task, params)
-        self._costs = np.full(len(x0), np.inf)
+        self._seconds, self._costs = 0.0, np.full(len(x0), np.inf)
+        self._known: dict[int, _Known] = {}
         self._best: dict[int, tuple[Motions, int]] = {}  # of each solved episode, and the row that it has among others
 
     @cached_property
@@ -105,19 +141,41 @@ class _Batch:
         return np.array([self._task.reference(x, c, self._params).x[-1] for x, c in episodes])
 
     @cached_property
+    def is_slalom(self) -> bool:
+        """Whether the task is to pass obstacles."""
+        return self._task.passed_obstacles(self._c[0]) is not None and self._task.steps % COARSE == 0
+
+    @cached_property
+    def _ends_at_a_point(self) -> bool:
+        return len(self._task.reference(self._x0[0], self._c[0], self._params).x) == 1
+
+    @cached_property
     def _obstacles(self) -> list[np.ndarray]:
         """(n, 3) of each slalom, as `Task.passed_obstacles` gives them."""
         return [np.asarray(self._task.passed_obstacles(c)) for c in self._c]
 
-    def optima(self) -> list[Optimum | None]:
-        """The best that is found of each episode."""
+    def search(self, guesses: int = 0, enough: float = math.inf) -> np.ndarray:
+        """Searches from the task's guesses, and then from random ones; returns costs (guesses, B) of the latter.
+
+        A cost is infinite where a guess leads to no solution. Solutions of slaloms that are clearly not the best are not
+        refined, so their costs are those with forces held longer.
+
+        Args:
+            guesses: random ones of each episode at most.
+            enough: solutions from random guesses after which an episode needs no more.
+        """
         started = time.perf_counter()
         with np.errstate(all="ignore"):  # motions that diverge may overflow, and are left out
             self._search()
-        seconds = (time.perf_counter() - started) / max(1, len(self._x0))
-        return [self._optimum(*self._best[i], seconds) if i in self._best else None for i in range(len(self._x0))]
+            costs = self._search_randomly(guesses, enough)
+        self._seconds = (time.perf_counter() - started) / max(1, len(self._x0))
+        return costs
 
-    def _optimum(self, found: Motions, i: int, seconds: float) -> Optimum:
+    def optima(self) -> list[Optimum | None]:
+        """The best that was found of each episode."""
+        return [self._optimum(*self._best[i]) if i in self._best else None for i in range(len(self._x0))]
+
+    def _optimum(self, found: Motions, i: int) -> Optimum:
         task, limit, n = self._task, self._params.force_limit, found.steps[i]
         end = np.full((1, found.x.shape[2]), np.nan if task.first_exit else 0.0)
         return Optimum(
@@ -130,7 +188,7 @@ class _Batch:
             violation=0.0,  # each constraint is kept by as much as it may be missed
             iterations=0,
             solver="ilqr",
-            seconds=seconds,
+            seconds=self._seconds,
             slopes=np.concatenate([found.slopes[i, :n], end]),
             markers=tuple(task.markers(self._c[found.of[i]])),
             feedback=partial(np.multiply, limit, found.gains[i, :n].copy()),
@@ -139,10 +197,10 @@ class _Batch:
     def _search(self) -> None:
         task = self._task
         if task.first_exit:
-            self._arrive()
-        elif task.passed_obstacles(self._c[0]) is not None and task.steps % COARSE == 0:
+            self._arrive(*self._paths(np.arange(len(self._x0))))
+        elif self.is_slalom:
             self._weave()
-        elif len(task.reference(self._x0[0], self._c[0], self._params).x) == 1:
+        elif self._ends_at_a_point:
             self._keep(self._recoveries(), _MOTION)  # over the first seconds where LQR is right about the rest
             self._follow_paths(np.flatnonzero(np.isinf(self._costs)))
         else:
@@ -263,28 +321,36 @@ class _Batch:
 
     def _recoveries(self) -> Motions:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
-        task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
-        n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
-        given, times = self._given(np.arange(count), task.steps), task.control_dt * np.arange(n)
+        count, n = len(self._x0), self._recovery_steps
         best = np.full(count, np.inf)
         x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
-
-        side = righting.leaning_aside(x0, np.ones(count)).T
-        path = np.zeros((count, n, 4))
-        path[..., :2] = self._ends[:, None, :2]
         for family in (_FAMILY, _SIDEWAYS_FAMILY):
             rows = np.flatnonzero(np.isinf(best))
-            for bandwidth, seconds, lean, fade in family if len(rows) else ():
-                path[..., 2:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
-                states, actions, costs = self._solver.simulate(
-                    x0[rows], n, task.control_dt, given[rows], path[rows], (bandwidth, seconds)
-                )
-                if rest is not None and n < task.steps:
-                    costs = costs + rest.costs(states[:, -1] - self._ends[rows])
+            for how in family if len(rows) else ():
+                states, actions, costs = self._recovered(rows, Recovery(*how))
                 cheaper = costs < best[rows]
                 for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
                     kept[rows[cheaper]] = values[cheaper]
         return Motions.guessed(np.arange(count), np.full(count, n), x, a).some(np.isfinite(best))
+
+    @property
+    def _recovery_steps(self) -> int:
+        """Control steps that are simulated; LQR's cost-to-go counts after them."""
+        task = self._task
+        return task.steps if self._solver.rest is None else min(task.steps, round(_SECONDS / task.control_dt))
+
+    def _recovered(self, of: np.ndarray, how: Recovery) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """States (J, n+1, 8), actions (J, n, 2) and costs (J,) of simulated recoveries of some episodes."""
+        task, x0, n = self._task, self._x0[of], self._recovery_steps
+        times, side = task.control_dt * np.arange(n), righting.leaning_aside(x0, np.ones(len(of))).T
+        path = np.zeros((len(of), n, 4))
+        path[..., :2] = self._ends[of, None, :2]
+        path[..., 2:] = how.lean * np.exp(-times / how.fade)[None, :, None] * side[:, None]
+        steering, given = (how.bandwidth, how.seconds), self._given(of, task.steps)
+        states, actions, costs = self._solver.simulate(x0, n, task.control_dt, given, path, steering)
+        if self._solver.rest is not None and n < task.steps:
+            costs = costs + self._solver.rest.costs(states[:, -1] - self._ends[of])
+        return states, actions, costs
 
     def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> Motions:
         """Guesses along ground paths (steps+1, 2) of the same number of steps."""
@@ -316,10 +382,12 @@ class _Batch:
             chosen = _contenders(found, BASIN_DOUBT)
         self._keep(self._along([of[i] for i in chosen], [paths[i] for i in chosen]), _PATH)
 
-    def _arrive(self) -> None:
-        """The episodes of first-exit tasks, as `Shooting.in_whole_steps` does it for one."""
+    def _arrive(self, of: Sequence[int], paths: Sequence[np.ndarray]) -> np.ndarray:
+        """The episodes of first-exit tasks along paths, as `Shooting.in_whole_steps` does it for one; returns costs (J,).
+
+        Solutions that are clearly not the best are not solved for whole steps, so their costs are those with a free length.
+        """
         task, n = self._task, FREE_TIME_INTERVALS
-        of, paths = self._paths(np.arange(len(self._x0)))
         lengths = np.array([len(path) - 1 for path in paths]) * task.control_dt / n
         x, a = self._motion(np.array([guess.resampled(path, n) for path in paths]), lengths, self._x0[of])
         x = np.concatenate([x, np.broadcast_to(lengths[:, None, None], (len(of), n + 1, 1))], axis=-1)
@@ -351,6 +419,9 @@ class _Batch:
                 best = min(costs, key=costs.__getitem__, default=0)
                 if costs and math.isfinite(costs[best]):
                     wanted += [(i, s) for s in (best - 1, best + 1) if s not in costs]
+        costs = relaxed.costs.copy()
+        costs[chosen] = [min(tried[i].values(), default=np.inf) for i in chosen.tolist()]
+        return costs
 
     def _weave(self) -> None:
         """Slaloms: likely choices of sides are compared with forces held longer, over the time until LQR is right about the
@@ -395,14 +466,78 @@ class _Batch:
         chosen = _contenders(rough, _SIDES_DOUBT)
         if not len(chosen):
             return
-        x = np.array([guess.resampled(states, steps) for states in rough.x[chosen]])
-        a = np.repeat(rough.a[chosen], coarse, axis=1)
-        near = Motions.guessed(rough.of[chosen], np.full(len(chosen), steps), x, a)
-        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=wanted[chosen])
-        self._pass_later(found)
-        left = chosen[np.isinf(self._kept(found))]
+        left = chosen[np.isinf(self._refine(rough.some(chosen), steps, wanted[chosen]))]
         if len(left):
             self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
+
+    def _refine(self, rough: Motions, steps: int, chosen_sides: np.ndarray | None = None) -> np.ndarray:
+        """Solves slaloms in full from solutions with forces held longer, keeps the cheapest, and returns all costs (J,)."""
+        x = np.array([guess.resampled(states, steps) for states in rough.x])
+        near = Motions.guessed(rough.of, np.full(len(x), steps), x, np.repeat(rough.a, COARSE, axis=1))
+        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=chosen_sides)
+        self._pass_later(found)
+        return self._kept(found)
+
+    def _search_randomly(self, guesses: int, enough: float) -> np.ndarray:
+        """Keeps the cheapest solutions from random guesses; returns costs (guesses, B), as `search` does."""
+        count = len(self._x0)
+        rngs = [random_guesses.generator(x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
+        costs = np.full((guesses, count), np.inf)
+        if guesses:
+            self._known = self._known_motions()
+        for first in range(0, guesses, LANES):
+            solved, numbers = np.isfinite(costs).sum(axis=0), np.arange(first, min(first + LANES, guesses))
+            left = np.flatnonzero((solved < enough) & ((solved > 0) | (first < _HOPELESS)))
+            number, of = (part.ravel() for part in np.meshgrid(numbers, left, indexing="ij"))
+            recovering = (number % 3 == 0) & self._ends_at_a_point & (not self.is_slalom)
+            for rows, search in ((recovering, self._recover_randomly), (~recovering, self._detour)):
+                if rows.any():
+                    costs[number[rows], of[rows]] = search(of[rows], rngs)
+        return costs
+
+    def _known_motions(self) -> dict[int, _Known]:
+        """The path of the best motion so far of each solved episode; in a slalom with its cost if forces are held longer."""
+        paths = {i: found.x[row, : found.steps[row] + 1, :2] for i, (found, row) in self._best.items()}
+        if not self.is_slalom or not paths:
+            return {i: _Known(path, np.inf) for i, path in paths.items()}
+        rough = self._solve(self._along(list(paths), list(paths.values()), COARSE), _SIDES, COARSE)
+        return {i: _Known(path, cost) for (i, path), cost in zip(paths.items(), rough.costs.tolist(), strict=True)}
+
+    def _recover_randomly(self, of: np.ndarray, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        """(J,) costs from a random recovery of each of some episodes."""
+        tried = [self._recovered(np.array([i]), random_guesses.recovery(rngs[i])) for i in of]
+        x, a, costs = (np.concatenate(part) for part in zip(*tried, strict=True))
+        survived = np.isfinite(costs)
+        guesses = Motions.guessed(of, np.full(len(of), self._recovery_steps), x, a)
+        costs[survived] = self._keep(guesses.some(survived), _MOTION)
+        return costs
+
+    def _detour(self, of: np.ndarray, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        """(J,) costs along a random detour of each of some episodes, of its best known motion or of a guessed path."""
+        task, paths = self._task, []
+        for i in of.tolist():
+            bases = task.guess_paths(self._x0[i], self._c[i], self._params)
+            if i in self._known and rngs[i].uniform() < 0.5:
+                bases = [self._known[i].path]
+            paths.append(random_guesses.detour(bases[rngs[i].integers(len(bases))], rngs[i], task.first_exit))
+        if task.first_exit:
+            return self._arrive(of.tolist(), paths)
+        if not self.is_slalom:
+            return self._keep(self._along(of.tolist(), paths), _PATH)
+        rough = self._solve(self._along(of.tolist(), paths, COARSE), _SIDES, COARSE)
+        costs = rough.costs.copy()
+        new = [row for row in _contenders(rough, _SIDES_DOUBT).tolist() if self._is_new(rough, row)]
+        if new:
+            costs[new] = self._refine(rough.some(np.array(new)), task.steps)
+        return costs
+
+    def _is_new(self, rough: Motions, row: int) -> bool:
+        """Whether a rough solution is another motion than the known one of its episode, and may be better."""
+        known = self._known.get(int(rough.of[row]))
+        if known is None:
+            return True
+        moved = np.abs(rough.x[row, :, :2] - known.path[::COARSE]).max()
+        return bool(moved > _SAME and rough.costs[row] < known.rough_cost * (1 + _SIDES_DOUBT))
 
     def _pass_later(self, found: Motions) -> None:
         """Replaces the best solution of every episode by one that passes the obstacles a control step later or earlier, where

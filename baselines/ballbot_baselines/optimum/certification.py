@@ -25,6 +25,8 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
+_SLALOM_GUESSES = 256  # random ones; of a robot that has to grip, one of thirty may lead to a solution
+
 AT_ONCE = LANES
 """Episodes whose second searches share the processor's lanes."""
 
@@ -54,7 +56,9 @@ def entries(
     while some := list(itertools.islice(left, AT_ONCE)):
         x0, c = (np.array(part) for part in zip(*(episode(task, params, index) for index in some), strict=True))
         # where optima move, each episode has another robot
-        second = None if randomization.moves_optima else batched.search_many(task, params, x0, c, Backoff())
+        second = (
+            None if randomization.moves_optima else batched.search_many(task, params, x0, c, Backoff(), _SLALOM_GUESSES)
+        )
         for k, index in enumerate(some):
             found: EvaluationSet | str = ""
             twice = True if second is None else second[k] or False

@@ -29,6 +29,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 _NO_CHEAPER = 1e-6  # relative
+_SLALOM_GUESSES = 32  # random ones of the second search
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
 
@@ -76,7 +77,9 @@ def find_optimum(
             break
     second = twice if isinstance(twice, Optimum) else None
     if twice is True:
-        (second,) = batched.search_many(task, params, x0[None], c[None], backoff) or [None]
+        (second,) = batched.search_many(task, params, x0[None], c[None], backoff, slalom_guesses=_SLALOM_GUESSES) or [
+            None
+        ]
     if second is not None:
         tried += _cheaper(episode, second, min((s.cost for s in tried if s.is_optimal), default=math.inf))
     within = [solution for solution in tried if solution.is_within_limits]
