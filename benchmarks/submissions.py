@@ -88,7 +88,7 @@ class Forger:
 
     def write(self, about: dict[str, Any] | None = None, **changes: Any) -> None:
         changed = replace(self.honest, about=self.honest.about | (about or {}), **changes)
-        files.write(self.target, recordings.to_bytes(changed))
+        files.write(self.target, changed.to_bytes())
 
     def size(self, low: float, high: float) -> float:
         return float(self.rng.choice([-1, 1]) * np.exp(self.rng.uniform(np.log(low), np.log(high))))

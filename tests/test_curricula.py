@@ -11,7 +11,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import default_params
 from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train.learning import curricula
-from ballbot_train.learning.curricula import CurriculumBatch, widened
+from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.learners import LEARNERS
 
 
@@ -63,14 +63,14 @@ def test_without_a_curriculum_episodes_and_rewards_are_those_of_the_batch(task):
     assert made.difficulty == {}
 
 
-def test_a_goal_that_is_twice_as_wide_holds_twice_as_far_out(task):
-    rng = np.random.default_rng(0)
-    x, c = task.sample(rng, default_params())
-    wide = widened(task, 2.0)
+def test_a_goal_that_is_twice_as_wide_holds_twice_as_far_out(constants):
+    constants(GOAL_FACTOR=2.0)
+    task, wide = batch().task, backwards().task
+    x, c = task.sample(np.random.default_rng(0), default_params())
     for own, easier in zip(task.goal(x, c), wide.goal(x, c), strict=True):
         assert easier + 1 == pytest.approx((own + 1) / 4)
-    assert (wide.problem(), wide.id) == (task.problem(), task.id)
-    assert widened(task, 1.0) is task
+    assert (replace(wide, max_speed=task.max_speed).problem(), wide.id) == (task.problem(), task.id)
+    assert batch().own_task is batch().task or batch().task == task
 
 
 def test_a_wide_goal_is_reached_by_who_misses_the_gate_by_less_than_it():
@@ -129,9 +129,11 @@ def test_without_pay_the_reward_is_minus_the_cost_and_a_failure_has_its_price(na
     assert run(made, 1)[0].reward.max() < 1 - curricula.FAILURE_PRICE
 
 
-def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
-    task = make_task("turn", duration=8.0)
-    starts = curricula.optimal_starts(task, default_params(), 1, 100)
+def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones(constants):
+    constants(OPTIMA=1)
+    made, task = batch(backwards=True), make_task("turn", duration=8.0)
+    run(made, 11)
+    starts = made._starts
     assert starts[-2].tolist() == list(range(starts.shape[1]))
     assert starts[:2, 0].tolist() == [0.0, -1.0]
     assert float(starts[5, 0]) == pytest.approx(float(starts[8, 0]))
@@ -156,7 +158,7 @@ def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
 
 
 def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypatch, constants):
-    monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps: some_starts(task))
+    monkeypatch.setattr(curricula, "_optimal_starts", lambda task, params, count, steps: some_starts(task))
     constants(EPISODES=2, SUCCESS=0.0, OPTIMA_SUCCESS=0.0, REACH=0.04)
     tiny = {"iterations": 3, "num_envs": 4, "num_steps": 24, "episode_seconds": 0.2, "batch_size": 16, "hidden": (8,)}
     settings = replace(LEARNERS["ppo"].settings("turn"), **tiny)

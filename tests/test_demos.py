@@ -19,7 +19,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main
 from ballbot_train.learning.datasets import command_of, load_demos
-from ballbot_train.learning.demonstrations import DemoConfig, Expert, record, write_demos
+from ballbot_train.learning.demonstrations import DemoConfig, Expert, write_demos
 from ballbot_train.policy.files import shipped_policies
 from ballbot_train.policy.network import load_policy
 
@@ -149,7 +149,7 @@ def test_the_expert_recovers_from_pushes():
     env = BallbotEnv("stabilize", physics="rk4")
     expert = Expert("nmpc", env.task, env.params, EXECUTED)
     start = {"state": [1, 0, 0, 0, 0, 3, 0, 0]}
-    recording, info = record(env, expert, np.random.default_rng(1), noise=0.02, pushes=2.0, options=start)
+    recording, info = expert.record(env, np.random.default_rng(1), noise=0.02, pushes=2.0, options=start)
     assert expert.plans > 5
     assert not info["failure"]
     assert len(recording["actions"]) == env.task.steps

@@ -15,7 +15,7 @@ from ballbot_train.learning import model_free, ppo, sac
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.sac import demos_in_frame
+from ballbot_train.learning.model_free import demos_in_frame
 from ballbot_train.policy.files import shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 

@@ -190,7 +190,7 @@ def test_a_shipped_policy_is_called_by_the_whole_way_of_its_training() -> None:
     assert cells == ["dagger → shac → ppo", "dagger → shac-late", "lqr", "ppo.json", "ppo"]
     made = Row("turn", "ppo", labels={"made_for": "rolling", "robot": "paper"})
     assert table_cells(shown, [made], ways) == [["turn", "ppo"]]
-    assert labels(["ppo", "lqr"], {"ppo": "dagger → shac → ppo"}) == {"ppo": "DAgger → SHAC → PPO", "lqr": "LQR"}
+    assert labels(["ppo", "lqr"], "turn", ways) == {"ppo": "DAgger → SHAC → PPO", "lqr": "LQR"}
 
 
 def test_table_terminal_report_and_figure_show_the_whole_way(

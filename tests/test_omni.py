@@ -321,9 +321,9 @@ def test_a_motion_on_wheels_is_verified_from_its_states_and_actions(tmp_path):
     held = recordings.read(path)
     mine = dataclasses.replace(held, about=held.about | {"name": "mine", "link": ""})
     assert mine.states.shape[1] == strong.state_size
-    row = verify("mine.npz", episodes=2, content=recordings.to_bytes(mine))
+    row = verify("mine.npz", episodes=2, content=mine.to_bytes())
     assert row.success == 1.0
     turned = mine.states.copy()
     turned[50, 8] += 1e-4  # the heading of one moment
     with pytest.raises(SubmissionError, match="step 50"):
-        verify("mine.npz", episodes=2, content=recordings.to_bytes(dataclasses.replace(mine, states=turned)))
+        verify("mine.npz", episodes=2, content=dataclasses.replace(mine, states=turned).to_bytes())

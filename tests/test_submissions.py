@@ -56,7 +56,7 @@ def forge(submitted, tmp_path):
     def of(about=None, **changes):
         honest = recordings.read(submitted()[1])
         forged = replace(honest, about=honest.about | (about or {}), **changes)
-        return verify(files.write(tmp_path / "forged.npz", recordings.to_bytes(forged)), EPISODES)
+        return verify(files.write(tmp_path / "forged.npz", forged.to_bytes()), EPISODES)
 
     return of
 
@@ -85,7 +85,7 @@ def test_an_episode_without_a_plan_has_failed_at_the_full_price(submitted, tmp_p
     gave_up = replace(
         honest, lengths=changed(honest.lengths, 0, 0), states=honest.states[first + 1 :], actions=honest.actions[first:]
     )
-    entry = verify(files.write(tmp_path / "gave-up.npz", recordings.to_bytes(gave_up)), EPISODES)
+    entry = verify(files.write(tmp_path / "gave-up.npz", gave_up.to_bytes()), EPISODES)
     assert (entry.falls, entry.ends, entry.costs[0]) == (1, ["no plan", "success"], 800.0)
 
 
@@ -174,7 +174,7 @@ def test_what_a_file_says_about_itself_is_checked(about, why, forge):
 def test_a_motion_of_another_engine_is_refused(submitted, tmp_path):
     honest = recordings.read(submitted("bullet")[1])
     renamed = replace(honest, about=honest.about | {"physics": "rk4"})
-    path = files.write(tmp_path / "renamed.npz", recordings.to_bytes(renamed))
+    path = files.write(tmp_path / "renamed.npz", renamed.to_bytes())
     with pytest.raises(SubmissionError, match="episode 0, step 1: the next state does not follow"):
         verify(path, EPISODES)
 
@@ -188,7 +188,7 @@ def test_a_folder_of_several_controllers_must_be_told_which(submitted, tmp_path)
     honest = recordings.read(submitted()[1])
     for name in ("a", "b"):
         told = replace(honest, about=honest.about | {"controller": name})
-        files.write(tmp_path / recordings.FOLDER / f"{name}.npz", recordings.to_bytes(told))
+        files.write(tmp_path / recordings.FOLDER / f"{name}.npz", told.to_bytes())
     with pytest.raises(ValueError, match="holds recordings of a, b; say which with --controller"):
         submit(tmp_path, "mine", "", tmp_path)
     assert [path.name for path in submit(tmp_path, "mine", "", tmp_path, "b")] == ["turn-mine-rk4.npz"]
@@ -206,7 +206,7 @@ def test_motions_survive_the_way_through_bytes_and_file(rng, tmp_path):
         recordings.Recording({}, np.array([n]), *(grid * part for grid, part in zip(grids, motion, strict=True)))
         for n, motion in zip(lengths, motions, strict=True)
     ]
-    arrived = [recordings.read("bytes", recordings.to_bytes(each)) for each in made]
+    arrived = [recordings.read("bytes", each.to_bytes()) for each in made]
     ran = make_task("turn"), "turn", named_robot("paper"), "rk4", "mine"
     joined = recordings.read(recordings.write_in(tmp_path, arrived, *ran))
     assert joined.lengths.tolist() == lengths
@@ -218,7 +218,7 @@ def test_motions_survive_the_way_through_bytes_and_file(rng, tmp_path):
 
 def test_of_a_simulation_that_exploded_what_no_number_holds_is_cut_off():
     exploded = recordings.Recording({}, np.array([1]), np.array([8 * [0.0], 8 * [-np.inf]]), np.array([[1e200, -1.0]]))
-    read = recordings.read("bytes", recordings.to_bytes(exploded))
+    read = recordings.read("bytes", exploded.to_bytes())
     assert read.states[1].tolist() == 8 * [-(2.0**36) * recordings.GRID]
     assert read.actions[0].tolist() == [2.0**36 * recordings.ACTION_GRID, -1.0]
 
@@ -251,10 +251,10 @@ def attack(physics, robot, steer, steps=400):
 def test_small_errors_of_every_step_that_together_lower_the_cost_are_refused(robot, physics, error, tmp_path):
     if physics not in installed_physics():
         pytest.skip(f"{physics} is not installed")
-    honest = files.write(tmp_path / "honest.npz", recordings.to_bytes(attack(physics, robot, 0.0)))
+    honest = files.write(tmp_path / "honest.npz", attack(physics, robot, 0.0).to_bytes())
     entry = verify(honest, EPISODES)
     assert (entry.success, entry.steered) == (1.0, 1e-4)
-    steered = files.write(tmp_path / "steered.npz", recordings.to_bytes(attack(physics, robot, error)))
+    steered = files.write(tmp_path / "steered.npz", attack(physics, robot, error).to_bytes())
     with pytest.raises(
         SubmissionError, match=r"episode 0: the small errors .* changed its cost by \d.*0\.01% is allowed"
     ):
@@ -290,7 +290,7 @@ def test_a_ball_that_slips_within_a_step_is_refused(physics, tmp_path):
     about = attack("rk4", "rolling", 0.0, 1).about | {"physics": physics}
     recording = recordings.Recording(about, np.full(EPISODES, 3), np.array(states), np.tile([1.0, 0.0], (6, 1)))
     with pytest.raises(SubmissionError, match=r"episode 0, step 1: the ball slips at \d.* m/s"):
-        verify(files.write(tmp_path / "slips.npz", recordings.to_bytes(recording)), EPISODES)
+        verify(files.write(tmp_path / "slips.npz", recording.to_bytes()), EPISODES)
 
 
 def test_costs_below_what_the_engine_explains_are_refused(submitted):
@@ -348,7 +348,7 @@ def test_a_refused_submission_replaces_and_removes_nothing(submitted, tmp_path):
     assert earlier.read_bytes() == b"earlier"
     (path,) = (folder / recordings.FOLDER).glob("*.npz")
     elsewhere = replace(recordings.read(path), about=recordings.read(path).about | {"task": "../../elsewhere"})
-    files.write(tmp_path / "run" / recordings.FOLDER / "a.npz", recordings.to_bytes(elsewhere))
+    files.write(tmp_path / "run" / recordings.FOLDER / "a.npz", elsewhere.to_bytes())
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SubmissionError, match=r"unknown task '\.\./\.\./elsewhere'"):
         submit(tmp_path / "run", "mine", "", out)
@@ -381,7 +381,7 @@ def test_a_row_says_whose_motion_it_is(submitted, tmp_path):
         states=np.concatenate([optimum.x for optimum in optima]),
         actions=np.concatenate([optimum.u for optimum in optima]) / named_robot("paper").force_limit,
     )
-    entry = verify(files.write(tmp_path / "optima.npz", recordings.to_bytes(replayed)), EPISODES)
+    entry = verify(files.write(tmp_path / "optima.npz", replayed.to_bytes()), EPISODES)
     assert entry.optima == EPISODES
 
 

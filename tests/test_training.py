@@ -9,6 +9,7 @@ import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train.commands.train import Run, command_line, command_with
+from ballbot_train.commands.train import Run, command_line, train
 from ballbot_train.learning import apg, training
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS
@@ -244,10 +245,12 @@ def test_recorded_commands_give_the_recorded_settings(path):
 
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("task", TASKS)
-def test_a_command_with_all_settings_gives_them_again(learner, task):
-    settings = LEARNERS[learner].settings(task)
-    options = Run(task=task, seed=3)
-    assert parsed(command_with(learner, options, settings)) == (learner, options, settings)
+def test_a_command_with_all_settings_gives_them_again(learner, task, monkeypatch):
+    recorded, settings = [], LEARNERS[learner].settings(task)
+    monkeypatch.setattr("ballbot_train.commands.train._train", lambda *given: recorded.append(given[-1]))
+    options = Run(task=task, seed=3, out=Path("runs/mine"))
+    train(learner, options, settings)
+    assert parsed(recorded[0]) == (learner, options, settings)
 
 
 @pytest.mark.parametrize("learner", LEARNERS)

@@ -6,7 +6,7 @@ from ballbot_gym.robot import PAPER
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation.controllers import controllers_of
-from ballbot_train.evaluation.names import ways_on, with_way
+from ballbot_train.evaluation.names import with_way
 from ballbot_train.evaluation.runner import open_run
 from ballbot_train.report import figures
 from ballbot_train.work import jobs
@@ -47,9 +47,8 @@ def basins(
     jobs.release(out)
     header = ["controller", "recovered", *(f"by lean and {basin.axis}" for basin in made)]
     shares = [[maps.fraction(made, name), *(maps.fraction([basin], name) for basin in made)] for name in names]
-    known = ways_on(ways, maps.TASK)
     rows = [
-        [with_way(name, known.get(name, "")), *(f"{share:.1%}" for share in group)]
+        [with_way(name, ways.get(f"{maps.TASK}/{name}", "")), *(f"{share:.1%}" for share in group)]
         for name, group in zip(names, shares, strict=True)
     ]
     print_table(f"Share of the recoverable states, {points} × {points} a map, physics={physics}", header, rows)

@@ -77,7 +77,7 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
         run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")
     settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
     settings.check()
-    _train(learner, run, settings, command or command_with(learner, run, settings))
+    _train(learner, run, settings, command or _command_with(learner, run, settings))
 
 
 def _train(learner: str, run: Run, settings: Any, command: str) -> None:
@@ -201,7 +201,7 @@ def _description(learner: str) -> str:
     return f"{described[:1].upper()}{described[1:]}."
 
 
-def command_with(learner: str, run: Run, settings: Any) -> str:
+def _command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
     for name, value in vars(run).items():

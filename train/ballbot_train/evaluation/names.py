@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 from ballbot_gym.engines import PHYSICS
@@ -42,15 +42,10 @@ def with_way(name: str, way: str) -> str:
 
     Args:
         name: of a shipped policy, such as "ppo" or "shac-late". Any other name stays as it is if there is no way.
-        way: its whole way, from `policy_files.way_of`.
+        way: its whole way, see `policy.files.shipped_ways`.
     """
     before, arrow, _ = way.rpartition(ARROW)
     return f"{before}{arrow}{name}" if not Path(name).suffix else name
-
-
-def ways_on(ways: Mapping[str, str], task: str) -> dict[str, str]:
-    """The ways of a task's policies by their names, of ways by "TASK/NAME"."""
-    return {key.partition("/")[2]: way for key, way in ways.items() if key.startswith(f"{task}/")}
 
 
 def shortened(names: Iterable[str]) -> dict[str, str]:

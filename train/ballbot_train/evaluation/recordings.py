@@ -53,12 +53,22 @@ class Recording:
     states: np.ndarray
     actions: np.ndarray
 
+    @classmethod
+    def of_episode(cls, trajectory: Trajectory | None, params: Robot) -> "Recording":
+        """What was done in one episode; None is that no plan was found."""
+        if trajectory is None:
+            return cls({}, np.zeros(1, np.int64), np.zeros((0, params.state_size)), np.zeros((0, params.action_size)))
+        return cls({}, np.array([len(trajectory.u)]), trajectory.x, trajectory.u / params.force_limit)
 
-def of_episode(trajectory: Trajectory | None, params: Robot) -> Recording:
-    """What was done in one episode; None is that no plan was found."""
-    if trajectory is None:
-        return Recording({}, np.zeros(1, np.int64), np.zeros((0, params.state_size)), np.zeros((0, params.action_size)))
-    return Recording({}, np.array([len(trajectory.u)]), trajectory.x, trajectory.u / params.force_limit)
+    def to_bytes(self) -> bytes:
+        """The content of its file."""
+        arrays = {
+            "about": np.frombuffer(json.dumps(self.about).encode(), np.uint8),
+            "lengths": self.lengths.astype(np.uint32),
+            "states": _packed(self.states / GRID),
+            "actions": _packed(self.actions / ACTION_GRID),
+        }
+        return files.npz(arrays)
 
 
 def write_in(
@@ -87,7 +97,7 @@ def write_in(
     }
     joined = (np.concatenate([getattr(each, part) for each in episodes]) for part in ("lengths", "states", "actions"))
     path = out / FOLDER / file_of(name, about["robot"], controller)
-    return files.write(path, to_bytes(Recording(about, *joined)))
+    return files.write(path, Recording(about, *joined).to_bytes())
 
 
 def file_of(task: str, robot: str, name: str, ending: str = ".npz", physics: str = "") -> str:
@@ -95,21 +105,10 @@ def file_of(task: str, robot: str, name: str, ending: str = ".npz", physics: str
     return f"{file_name(task, robot)}-{file_part(name)}{physics and f'-{physics}'}{ending}"
 
 
-def to_bytes(recording: Recording) -> bytes:
-    """The content of a recording's file."""
-    arrays = {
-        "about": np.frombuffer(json.dumps(recording.about).encode(), np.uint8),
-        "lengths": recording.lengths.astype(np.uint32),
-        "states": _packed(recording.states / GRID),
-        "actions": _packed(recording.actions / ACTION_GRID),
-    }
-    return files.npz(arrays)
-
-
 def read(path: str | Path, content: bytes | None = None) -> Recording:
-    """What `to_bytes` gave, in a file. Sizes are checked before anything is unpacked, and nothing in the file is executed.
+    """What `Recording.to_bytes` gave, in a file. Sizes are checked before anything is unpacked, and nothing is executed.
 
-    Args: content: as `to_bytes` gives it, if it is read already.
+    Args: content: as `Recording.to_bytes` gives it, if it is read already.
 
     Raises:
         FileError: it is missing, damaged, too large, or no recording.

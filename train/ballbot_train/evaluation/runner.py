@@ -254,7 +254,7 @@ def _episode_entries(
     results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)
     env.close()
     for i, result in enumerate(results):
-        moved = {} if motions is None else {"motion": base64.b64encode(recordings.to_bytes(motions[i])).decode()}
+        moved = {} if motions is None else {"motion": base64.b64encode(motions[i].to_bytes()).decode()}
         yield asdict(result) | moved
 
 
@@ -319,7 +319,7 @@ def run_episodes(
                 "effort": float(np.hypot.reduce(run.trajectory.u, axis=1).mean()),
             }
         if motions is not None:
-            motions.append(recordings.of_episode(None if run is None else run.trajectory, env.params))
+            motions.append(recordings.Recording.of_episode(None if run is None else run.trajectory, env.params))
         results.append(Result(task, name, i, env.physics, optimum=float(known.costs[i]), **measures))
         advance(1)
     return results

@@ -231,7 +231,7 @@ def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str,
                 raise SubmissionError(
                     f"{results} holds two recordings for {file}; evaluate each into a folder of its own"
                 )
-            packed[file] = recordings.to_bytes(replace(recording, about=about))
+            packed[file] = replace(recording, about=about).to_bytes()
     return packed
 
 

@@ -1,4 +1,4 @@
-"""What a critic sees, and the value that it starts from.
+"""What a critic sees, and the cost to go that its values stand for.
 
 The value of a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, so the robot
 would rest off the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
@@ -9,7 +9,6 @@ from typing import cast
 
 import torch
 
-from ballbot_gym.tasks import Task
 from ballbot_train.policy.weights import linear_layers
 
 _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
@@ -54,51 +53,7 @@ class QuadraticCritic(torch.nn.Module):
         return self.mlp(inputs) + self.linear(inputs)
 
 
-def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:
-    """Discounted sum of scaled rewards of living indefinitely without cost; without a discount, for the task's duration.
-
-    Critics start from it, because the values of good policies are near it and far from 0.
-    """
-    paid = reward_scale * task.survival_reward * task.control_dt
-    return paid / (1 - gamma) if gamma < 1 else paid * task.steps
-
-
-def highest_value(task: Task, reward_scale: float, gamma: float) -> float:
-    """The most that a discounted sum of scaled rewards can be, because costs are not negative.
-
-    Where an episode ends at its goal, the time that is left is paid at once, without a discount.
-    """
-    living = value_of_living(task, reward_scale, gamma)
-    return max(living, value_of_living(task, reward_scale, 1.0)) if task.first_exit else living
-
-
-def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float) -> torch.Tensor:
-    """Advantages relative to the cost to go, normalized, of returns and values of any one shape.
-
-    Args:
-        returns: estimates of the return.
-        values: what the critic expects.
-        living: value of a state without any cost, so that the cost to go is `living` minus the value.
-    """
-    relative = (returns - values) / _cost_to_go(values, living)
-    return (relative - relative.mean()) / (relative.std() + 1e-8)
-
-
-def weigh_gradients(values: Sequence[torch.Tensor], living: float) -> None:
-    """Divides gradients that flow back into the values (n, 1) of several critics by the cost to go, as the lowest say it.
-
-    The mean of all n factors is 1. For `living` see `relative_advantages`.
-    """
-    if not values[0].requires_grad:
-        return
-    lowest = torch.stack([value.detach() for value in values]).amin(0)
-    weights = _cost_to_go(lowest, living) ** -1
-    weights /= weights.mean()
-    for value in values:
-        value.register_hook(lambda gradient: gradient * weights)
-
-
-def _cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
+def cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
     """The costs to go that values of any shape stand for, but no less than a share of their mean.
 
     Args:

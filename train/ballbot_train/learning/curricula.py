@@ -233,13 +233,13 @@ class CurriculumBatch(BallbotBatch):
     def _set_difficulty(self) -> None:
         """Makes `task` what the curriculum has reached."""
         # a batch computes nothing from goal and ramp in advance
-        vars(self)["task"] = widened(replace(self.own_task, **self._ramp), self._goal_factor)
+        vars(self)["task"] = _widened(replace(self.own_task, **self._ramp), self._goal_factor)
         self._eligible: torch.Tensor | None = None
 
     def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
         if self._starts is None:
-            self._starts = optimal_starts(self._full, self.params, _OPTIMA, self.own_task.steps)
+            self._starts = _optimal_starts(self._full, self.params, _OPTIMA, self.own_task.steps)
         if self._eligible is None:  # states outside of the goal, which may be wide
             x, c = self._starts[:8].unbind(0), self._starts[8:-2].unbind(0)
             inside = self.task.goal(x, self.task.at(c, self.task.duration))
@@ -306,7 +306,7 @@ class CurriculumBatch(BallbotBatch):
         self.state = self.state._replace(steps=torch.where(short, self.state.steps.clamp(min=least), self.state.steps))
 
 
-def widened(task: Task, factor: float) -> Task:
+def _widened(task: Task, factor: float) -> Task:
     """The task with tolerances of its goal that are `factor` times wider.
 
     Every goal function is a ratio of squares, less 1.
@@ -322,7 +322,7 @@ def widened(task: Task, factor: float) -> Task:
     return wide(**{field.name: getattr(task, field.name) for field in fields(task)})
 
 
-def optimal_starts(task: Task, params: Robot, count: int, steps: int) -> torch.Tensor:
+def _optimal_starts(task: Task, params: Robot, count: int, steps: int) -> torch.Tensor:
     """The states along the optima of `count` episodes drawn for training, before their ends and before control step `steps`.
 
     The optima leave the share `_RESERVE` of the goal's tolerances unused.

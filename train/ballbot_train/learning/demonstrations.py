@@ -138,64 +138,62 @@ class Expert:
         force = self._controller.act(t, x)
         return np.clip(force / self._params.force_limit, -1, 1).astype(np.float32)
 
+    def record(
+        self,
+        env: BallbotEnv,
+        rng: np.random.Generator,
+        noise: float,
+        pushes: float,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Records an episode under noise and pushes.
 
-def record(
-    env: BallbotEnv,
-    expert: Expert,
-    rng: np.random.Generator,
-    noise: float,
-    pushes: float,
-    seed: int | None = None,
-    options: dict[str, Any] | None = None,
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Records an episode of an expert under noise and pushes.
+        Args:
+            env: the environment.
+            rng: of the exploration.
+            noise: as in `DemoConfig`; the episode's standard deviation is drawn from [0, noise].
+            pushes: as in `DemoConfig`.
+            seed: as for `env.reset`.
+            options: as for `env.reset`.
 
-    Args:
-        env: the environment.
-        expert: gives the label in every control step.
-        rng: of the exploration.
-        noise: as in `DemoConfig`; the episode's standard deviation is drawn from [0, noise].
-        pushes: as in `DemoConfig`.
-        seed: as for `env.reset`.
-        options: as for `env.reset`.
+        Returns:
+            The arrays of a shard of this episode of T steps, and the last step's info:
 
-    Returns:
-        The arrays of a shard of this episode of T steps, and the last step's info:
+            | array | shape | |
+            |---|---|---|
+            | observations | (T+1, no) float32 | |
+            | states | (T+1, 8) | order and units in `Ballbot.STATE` |
+            | labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
+            | actions | (T, 2) float32 | executed |
+            | rewards | (T,) | |
+            | terminations, truncations | (T,) bool | |
 
-        | array | shape | |
-        |---|---|---|
-        | observations | (T+1, no) float32 | |
-        | states | (T+1, 8) | order and units in `Ballbot.STATE` |
-        | labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
-        | actions | (T, 2) float32 | executed |
-        | rewards | (T,) | |
-        | terminations, truncations | (T,) bool | |
-
-    Raises:
-        PlanError: the expert has no plan from the start.
-    """
-    dt = env.task.control_dt
-    observation, info = env.reset(seed=seed, options=options)
-    expert.reset(0.0, info["state"], info["constants"])
-    std = noise * rng.random()
-    made: dict[str, list[Any]] = {name: [] for name in IN_DATASET}
-    made["observations"].append(observation)
-    made["states"].append(info["state"])
-    pushed = done = False
-    while not done:
-        t = dt * len(made["actions"])
-        if pushed:
-            expert.replan(t, info["state"])
-        label = expert.label(t, info["state"])
-        pushed = rng.random() < pushes * dt
-        disturbed = rng.uniform(-1, 1, len(label)) if pushed else label + std * rng.standard_normal(len(label))
-        action = np.clip(disturbed, -1, 1).astype(np.float32)
-        observation, reward, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        step = observation, info["state"], label, action, reward, terminated, truncated
-        for values, value in zip(made.values(), step, strict=True):
-            values.append(value)
-    return {name: np.array(values) for name, values in made.items()}, info
+        Raises:
+            PlanError: the expert has no plan from the start.
+        """
+        dt = env.task.control_dt
+        observation, info = env.reset(seed=seed, options=options)
+        self.reset(0.0, info["state"], info["constants"])
+        std = noise * rng.random()
+        made: dict[str, list[Any]] = {name: [] for name in IN_DATASET}
+        made["observations"].append(observation)
+        made["states"].append(info["state"])
+        pushed = done = False
+        while not done:
+            t = dt * len(made["actions"])
+            if pushed:
+                self.replan(t, info["state"])
+            label = self.label(t, info["state"])
+            pushed = rng.random() < pushes * dt
+            disturbed = rng.uniform(-1, 1, len(label)) if pushed else label + std * rng.standard_normal(len(label))
+            action = np.clip(disturbed, -1, 1).astype(np.float32)
+            observation, reward, terminated, truncated, info = env.step(action)
+            done = terminated or truncated
+            step = observation, info["state"], label, action, reward, terminated, truncated
+            for values, value in zip(made.values(), step, strict=True):
+                values.append(value)
+        return {name: np.array(values) for name, values in made.items()}, info
 
 
 def _content(config: DemoConfig) -> dict[str, Any]:
@@ -286,7 +284,7 @@ def _recorded(config: DemoConfig, episodes: Sequence[int]) -> dict[str, np.ndarr
     for seed in map(config.episode_seed, episodes):
         rng = np.random.default_rng([seed, 1])  # other numbers than the env's
         try:
-            recording, info = record(env, expert, rng, config.noise, config.pushes, seed)
+            recording, info = expert.record(env, rng, config.noise, config.pushes, seed)
         except PlanError:  # the expert has no plan from this start
             continue
         facts = {

@@ -18,9 +18,8 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector.batch import BatchState
-from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of
-from ballbot_train.learning.critics import value_of_living, weigh_gradients
+from ballbot_train.learning.critics import cost_to_go
 from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.fitting import Fit, Samples
@@ -187,13 +186,26 @@ class ModelFree(ABC):
         return gamma ** (self._trained.control_dt / self._task.control_dt)
 
     def _value_of_living(self, gamma: float) -> float:
-        """Value of living indefinitely without cost."""
-        return value_of_living(self._trained, self._reward_scale, gamma) if self._pay else 0.0
+        """Value of living indefinitely without cost: the discounted sum of scaled rewards. Without a discount, that of living
+        for the task's duration. 0 where living does not pay.
+
+        Critics start from it, because the values of good policies are near it and far from 0.
+        """
+        paid = self._reward_scale * self._trained.survival_reward * self._trained.control_dt if self._pay else 0.0
+        return paid / (1 - gamma) if gamma < 1 else paid * self._trained.steps
 
     def _weigh(self, _critics: nn.Module, _inputs: Any, values: Any) -> None:
-        """A forward hook of critics: makes gradients at their values, a tensor or several, relative to the cost to go."""
+        """A forward hook of critics: divides gradients that flow back into their values (n, 1), a tensor or several, by the
+        cost to go, as the lowest say it. The mean of all n factors is 1.
+        """
         several = (values,) if isinstance(values, torch.Tensor) else values
-        weigh_gradients(several, self._value_of_living(self._model.gamma))
+        if not several[0].requires_grad:
+            return
+        lowest = torch.stack([value.detach() for value in several]).amin(0)
+        weights = cost_to_go(lowest, self._value_of_living(self._model.gamma)) ** -1
+        weights /= weights.mean()
+        for value in several:
+            value.register_hook(lambda gradient: gradient * weights)
 
     @property
     def network(self) -> PolicyNetwork:
@@ -286,8 +298,8 @@ class ModelFree(ABC):
         rate, fraction = self._settings.learning_rate, self._settings.final_learning_rate_fraction
         if self._settled is not None and self._env.batch.backwards:
             settled = _SETTLED_LEARNING_RATE
-            return schedules.linear(settled, fraction * rate / settled, self._since_settled)
-        return schedules.linear(rate, fraction, self._progress)
+            return _linear(settled, fraction * rate / settled, self._since_settled)
+        return _linear(rate, fraction, self._progress)
 
     @property
     def _critic_only(self) -> bool:
@@ -298,7 +310,7 @@ class ModelFree(ABC):
         assert self._imitation is not None
         assert self._demos is not None
         rng = np.random.default_rng(int(torch.randint(2**31, ())))
-        rate = schedules.linear(_CLONE_RATE, 0.0, self.iteration / self._clone_iterations)
+        rate = _linear(_CLONE_RATE, 0.0, self.iteration / self._clone_iterations)
         return {"loss/cloning": self._imitation.run(self._demos, _CLONE_STEPS, _CLONE_BATCH, rate, rng)}
 
     def _improve(self) -> dict[str, float]:
@@ -306,7 +318,9 @@ class ModelFree(ABC):
         settings, model = self._settings, self._model
         if self._settled is None and self._env.batch.is_settled:
             self._settled = self._share_done
-        self._raise_gamma(self._per_step(schedules.discount(settings.gamma, settings.final_gamma, self._progress)))
+        # 1 less the discount factor falls geometrically
+        short, shortest = 1 - settings.gamma, 1 - settings.final_gamma
+        self._raise_gamma(self._per_step(1 - short * (shortest / short) ** self._progress))
         self._actor.requires_grad_(not self._critic_only)
         # SB3 takes None as "never" for its own printing
         model.learn(settings.num_envs * settings.num_steps, log_interval=cast(int, None), reset_num_timesteps=False)
@@ -374,7 +388,7 @@ class _TrainingEnv(BallbotVecEnv):
         reward = self._scale * reward
         if self._frame is not None:
             for i in np.flatnonzero(done).tolist():
-                last, _ = seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
+                last, _ = _seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
                 infos[i]["terminal_observation"] = last[0]
         if self.bootstrap is not None:
             self._add_last_values(self.bootstrap, reward, infos)
@@ -404,8 +418,13 @@ class _TrainingEnv(BallbotVecEnv):
         """What the learner sees of observations (num_envs, no); notes where the frame's axes are."""
         if self._frame is None:
             return observation
-        features, self._axes = seen_in(self._frame, observation)
+        features, self._axes = _seen_in(self._frame, observation)
         return features
+
+
+def _linear(start: float, final_fraction: float, progress: float) -> float:
+    """Falls from `start` to `final_fraction * start` along a straight line, as `progress` goes from 0 to 1."""
+    return start * (1 - (1 - final_fraction) * progress)
 
 
 def _global_random() -> dict[str, Any]:
@@ -414,7 +433,7 @@ def _global_random() -> dict[str, Any]:
     return {"torch": torch.get_rng_state(), "numpy": [kind, words.tolist(), *rest]}
 
 
-def seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What a frame shows of observations (n, no), and where its axes are.
 
     Returns:
@@ -423,6 +442,17 @@ def seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndar
     features, back = frame.features(tuple(observations.T))
     one, zero = np.ones(len(observations), np.float32), np.zeros(len(observations), np.float32)
     return _columns(features), np.stack([_columns(back(unit)) for unit in ((one, zero), (zero, one))], -1)
+
+
+def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
+    """Demonstrations with features instead of observations, and with actions in the frame."""
+    observations, axes = _seen_in(frame, demos.observations)
+    next_observations, _ = _seen_in(frame, demos.next_observations)
+    turned = {
+        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(REACH)
+        for name in ("actions", "executed")
+    }
+    return replace(demos, observations=observations, next_observations=next_observations, **turned)
 
 
 def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:

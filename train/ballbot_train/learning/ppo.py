@@ -19,9 +19,8 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from ballbot_gym.robot import Robot, registered_name
 from ballbot_gym.tasks import Task
-from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
-from ballbot_train.learning.critics import QuadraticCritic, relative_advantages
+from ballbot_train.learning.critics import QuadraticCritic, cost_to_go
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.learning.settings import number
@@ -145,7 +144,8 @@ class _RelativeRollouts(RolloutBuffer):
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
         super().compute_returns_and_advantage(last_values, dones)
         returns, values = torch.as_tensor(self.returns), torch.as_tensor(self.values)
-        self.advantages = relative_advantages(returns, values, self._living(self.gamma)).numpy()
+        relative = (returns - values) / cost_to_go(values, self._living(self.gamma))
+        self.advantages = ((relative - relative.mean()) / (relative.std() + 1e-8)).numpy()
 
 
 def _mean(network: PolicyNetwork, observation: torch.Tensor) -> torch.Tensor:
@@ -268,7 +268,8 @@ class Ppo(ModelFree):
         return self._model.gamma * values.squeeze(-1).numpy()
 
     def _improve(self) -> dict[str, float]:
-        std = schedules.geometric(self.config.std, self.config.final_std, self._progress)
+        first, last = self.config.std, self.config.final_std
+        std = first * (last / first) ** self._progress
         self._log_std.data.fill_(np.log(std))
         # by so much the gradient of the expert's likelihood is greater than that of the squared difference
         self._imitation_weight = self.config.imitation_weight * float(self._log_std.exp()[0]) ** -2

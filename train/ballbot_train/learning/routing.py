@@ -30,15 +30,15 @@ def fit_routes(
     task: Task,
     params: Robot,
     seed: int,
-) -> float:
+) -> tuple[float, float]:
     """Fits the network to the predicted costs of `EPISODES` slaloms drawn for training.
 
     Returns:
         How much more its choices cost than the ones predicted to be the best, relative to the cost of the episode, on a tenth
-        of these slaloms, to which it was not fitted.
+        of these slaloms, to which it was not fitted; and how much more the nearer sides of all obstacles cost.
     """
     console.print(f"learning on which sides to pass obstacles, from {EPISODES:,} drawn slaloms")
-    observations, regrets = predicted_regrets(task, params, seed, EPISODES)
+    observations, regrets = _predicted_regrets(task, params, seed, EPISODES)
     layouts = routes.layout(torch.as_tensor(observations, dtype=torch.float32))
     costs = torch.as_tensor(regrets, dtype=torch.float32)
     wanted = torch.softmax(-costs / _TOLERANCE, -1)
@@ -57,10 +57,10 @@ def fit_routes(
         chosen = routes.mlp(layouts[:kept]).argmax(-1, keepdim=True)
     regret, nearer = (float(part.clamp(max=1.0).mean()) for part in (costs[:kept].gather(1, chosen), costs[:kept, 0]))
     console.print(f"its sides cost {regret:.2%} more than those predicted to be the best, the nearer ones {nearer:.2%}")
-    return regret
+    return regret, nearer
 
 
-def predicted_regrets(task: Task, params: Robot, seed: int, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _predicted_regrets(task: Task, params: Robot, seed: int, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """What every choice of farther sides costs more than the best one, relative to the cost of the episode.
 
     Returns:

@@ -22,12 +22,11 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from ballbot_gym.robot import Robot, registered_name
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_train.learning.actors import spec_for, started
-from ballbot_train.learning.critics import QuadraticCritic, highest_value
+from ballbot_train.learning.critics import QuadraticCritic
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, seen_in
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, demos_in_frame
 from ballbot_train.learning.settings import MOST, number
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy.files import Mirrors
@@ -182,17 +181,6 @@ class _SymmetricReplay(NStepReplayBuffer):
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
-    """Demonstrations with features instead of observations, and with actions in the frame."""
-    observations, axes = seen_in(frame, demos.observations)
-    next_observations, _ = seen_in(frame, demos.next_observations)
-    turned = {
-        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(REACH)
-        for name in ("actions", "executed")
-    }
-    return replace(demos, observations=observations, next_observations=next_observations, **turned)
-
-
 class _OwnActor(Actor):
     """SB3's actor as a policy network, whose mean actions may be centred."""
 
@@ -341,8 +329,12 @@ class Sac(ModelFree):
         load_state(self, ["_replay"], state)
 
     def _highest(self) -> float:
-        """The most that a value can be."""
-        return highest_value(self._trained, self._reward_scale, self._model.gamma) if self._pay else 0.0
+        """The most that a value can be, because costs are not negative.
+
+        Where an episode ends at its goal, the time that is left is paid at once, without a discount.
+        """
+        living = self._value_of_living(self._model.gamma)
+        return max(living, self._value_of_living(1.0)) if self._trained.first_exit else living
 
 
 make = Sac

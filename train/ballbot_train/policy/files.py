@@ -206,7 +206,7 @@ def read_description(path: str | Path) -> dict[str, Any]:
     return read
 
 
-def way_of(path: str | Path) -> str:
+def _way_of(path: str | Path) -> str:
     """The whole way of a policy by the record in its file: all learners and demonstrators in turn, as "dagger → shac".
 
     "" where the record holds no command of `ballbot train`.
@@ -221,7 +221,7 @@ def way_of(path: str | Path) -> str:
 @lru_cache(maxsize=1)
 def shipped_ways() -> Mapping[str, str]:
     """The whole way of each shipped policy, by the SHA-256 of its weights."""
-    return {weights_digest(path): way_of(path) for path in SHIPPED.glob("*.json")}
+    return {weights_digest(path): _way_of(path) for path in SHIPPED.glob("*.json")}
 
 
 def shipped_policies(task: Task, robot: str = PAPER, track: str | None = "") -> dict[str, Path]:

@@ -114,10 +114,10 @@ class PolicyNetwork(torch.nn.Module):
             plain = observation.ndim == 1 and torch.is_inference_mode_enabled()
             features, back = self.features(self._seen(observation, plain))
             features = (*features, *(estimates.tolist() if plain else estimates.unbind(-1)))
-            action = self.centred(self._sum(stacked(features, observation)), features)
+            action = self.centred(self._sum(_stacked(features, observation)), features)
             if self.spec.squash == "tanh_in_frame":
                 action = REACH * torch.tanh(action)
-            return stacked(back(tuple(action.tolist()) if plain else action.unbind(-1)), observation)
+            return _stacked(back(tuple(action.tolist()) if plain else action.unbind(-1)), observation)
         if self.spec.informed:
             observation = torch.cat([observation, estimates], -1)
         total = self._sum(observation)
@@ -152,7 +152,7 @@ class PolicyNetwork(torch.nn.Module):
             return observation
         own, past = observation[..., : self.spec.observations], observation[..., self.spec.observations :]
         features, _ = self._frame.features(self._seen(own))
-        return torch.cat([stacked(features, observation), past], -1)
+        return torch.cat([_stacked(features, observation), past], -1)
 
     def centred(self, output: torch.Tensor, features: tuple[Any, ...]) -> torch.Tensor:
         """The network's output (..., 2) for features of its frame, before it is squashed. A centred policy's is less what the
@@ -161,8 +161,8 @@ class PolicyNetwork(torch.nn.Module):
         if not self.spec.centred:
             return output
         kept, action = self.kept(features)
-        output = output - self._sum(stacked(kept, output))
-        needed = stacked(action, output)
+        output = output - self._sum(_stacked(kept, output))
+        needed = _stacked(action, output)
         if self.spec.squash != "clip":
             reach = REACH if self.spec.squash == "tanh_in_frame" else 1
             needed = (needed / reach).clamp(-0.999, 0.999).atanh()
@@ -209,13 +209,13 @@ class Routes(torch.nn.Module):
     def sides(self, seen: tuple[Any, ...]) -> tuple[Any, ...]:
         """The same (n) for the numbers of an observation (no), which are tensors or plain ones. No gradient reaches them."""
         with torch.no_grad():
-            best = self.mlp(stacked(self.route.layout(seen), self._choices)).argmax(-1)
+            best = self.mlp(_stacked(self.route.layout(seen), self._choices)).argmax(-1)
             if isinstance(seen[0], torch.Tensor):
                 return self.route.sides(seen, self._choices[best].unbind(-1))
             return self.route.sides(seen, farther_choices(self.route.obstacles)[int(best)])
 
 
-def stacked(values: Sequence[Any], like: torch.Tensor) -> torch.Tensor:
+def _stacked(values: Sequence[Any], like: torch.Tensor) -> torch.Tensor:
     """(..., n) of n tensors (...), or of n plain numbers a tensor as another one is."""
     return torch.stack(tuple(values), -1) if isinstance(values[0], torch.Tensor) else like.new_tensor(values)
 

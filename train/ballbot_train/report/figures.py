@@ -17,8 +17,7 @@ from matplotlib.ticker import LogFormatter
 from ballbot_gym import files
 from ballbot_gym.robot import Ballbot, Robot
 from ballbot_gym.tasks.marker import Marker
-from ballbot_train.evaluation.basins import AXES, BasinMap, fraction
-from ballbot_train.evaluation.names import ways_on
+from ballbot_train.evaluation.basins import AXES, TASK, BasinMap, fraction
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
 from ballbot_train.report.labels import ORDER, color, labels
@@ -111,7 +110,7 @@ def regret_figure(results: Sequence[Result], ways: Mapping[str, str] = {}) -> Fi
     figure = Figure(figsize=(4.2 * len(tasks), 3.8), layout="constrained")
     axes = figure.subplots(1, len(tasks), squeeze=False)
     for axis, task in zip(axes[0], tasks, strict=True):
-        named = labels((result.controller for result in results if result.task == task), ways_on(ways, task))
+        named = labels((result.controller for result in results if result.task == task), task, ways)
         for i, controller in enumerate(named):
             group = [result for result in results if (result.task, result.controller) == (task, controller)]
             # an episode that stands but misses its goal has no meaningful regret
@@ -137,7 +136,7 @@ def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = 
     Regret, with its 95 % interval, is drawn where at least half of the episodes did not fail.
     """
     stresses = list(dict.fromkeys(row.labels["stress"] for row in rows if row.labels["stress"] != NONE))
-    named = labels((row.controller for row in rows if row.task == task), ways_on(ways, task))
+    named = labels((row.controller for row in rows if row.task == task), task, ways)
     figure = Figure(figsize=(2.9 * len(stresses), 5.6), layout="constrained")
     axes = figure.subplots(2, len(stresses), squeeze=False, sharey="row", sharex="col")
     figure.suptitle(f"{task}: success and regret under disturbances", fontsize=13)
@@ -167,7 +166,7 @@ def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = 
 
 def basin_figure(maps: Sequence[BasinMap], ways: Mapping[str, str] = {}) -> Figure:
     """The initial states that each controller brings to rest, coloured, on those that the robot's limits allow, grey."""
-    controllers, named = list(maps[0].recovered), labels(maps[0].recovered, ways_on(ways, "stabilize"))
+    controllers, named = list(maps[0].recovered), labels(maps[0].recovered, TASK, ways)
     size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(maps), len(controllers), squeeze=False, sharex=True, sharey="row")

@@ -41,14 +41,15 @@ def label(controller: str, way: str = "") -> str:
     return ARROW.join(_CONTROLLERS.get(part, (part, ""))[0] for part in with_way(stem, way).split(ARROW))
 
 
-def labels(controllers: Iterable[str], ways: Mapping[str, str] = {}) -> dict[str, str]:
+def labels(controllers: Iterable[str], task: str = "", ways: Mapping[str, str] = {}) -> dict[str, str]:
     """The label of each controller of a figure, by its name. No two are the same: then of paths more is shown.
 
     Args:
         controllers: their names.
-        ways: the whole ways of shipped policies, by their names.
+        task: of the figure.
+        ways: the whole ways of shipped policies by "TASK/NAME".
     """
-    found = {name: label(name, ways.get(name, "")) for name in controllers}
+    found = {name: label(name, ways.get(f"{task}/{name}", "")) for name in controllers}
     short, counts = shortened(found), Counter(found.values())
     found = {name: short[name] if counts[text] > 1 else text for name, text in found.items()}
     return found if len(set(found.values())) == len(found) else dict(zip(found, found, strict=True))
