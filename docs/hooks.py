@@ -19,7 +19,7 @@ from mkdocs.structure.files import File
 
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.report.playground import write_playground
+from ballbot_train.report.playground import playground_page
 
 _ROOT = Path(__file__).parent.parent
 _SORTS = _ROOT / "train" / "ballbot_train" / "report" / "assets" / "table.js"
@@ -54,7 +54,9 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
 
 def on_post_build(config: Any, **_: Any) -> None:
     """Called by mkdocs after the pages: writes the playground that docs/playground.md shows."""
-    write_playground(Path(config["site_dir"]) / "playground" / "page.html")
+    folder = Path(config["site_dir"]) / "playground"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "page.html").write_text(playground_page(), encoding="utf-8")
 
 
 def notebook_page(path: Path) -> str:

@@ -31,7 +31,7 @@ from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries
 from ballbot_train.policy.files import SHIPPED
 from ballbot_train.report import figures, labels
-from ballbot_train.report.replay import Replay, Take, certified_replay, driven_path
+from ballbot_train.report.replay import Replay, Take, certified_replay
 
 PAGE = Path(__file__).parent / "gallery.md"
 FILMS = make_leaderboard.FILMS
@@ -117,7 +117,7 @@ def drawing(replay: Replay, optimum: Trajectory, t: float) -> Drawing:
     """A moment, s, with the optimum as a ghost."""
     drawn = replay.drawing(replay.takes[0], t)
     ghost = Drawn(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY)
-    path = GroundPath(driven_path(optimum, t), labels.OPTIMUM, True)
+    path = GroundPath(optimum.path_until(t), labels.OPTIMUM, True)
     return replace(drawn, robots=(ghost, *drawn.robots), paths=(*drawn.paths, path))
 
 

@@ -6,7 +6,7 @@ import pytest
 from builders import result
 
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.statistics import interval, share_interval, verdict
+from ballbot_train.evaluation.statistics import interval, share_interval
 
 EXPERT, POLICY = "lqr", "shac"
 
@@ -63,13 +63,6 @@ def test_the_interval_of_degenerate_data_exists_or_is_nan_without_a_warning(recw
     low, high = interval([0.0] * 199 + [1.0])
     assert 0 <= low <= high < 0.1
     assert len(recwarn) == 0
-
-
-def test_a_difference_within_the_margin_decides_nothing():
-    assert verdict(0.02, 0.03, 0.01) == "better"
-    assert verdict(0.005, 0.03, 0.01) == "cannot tell"
-    assert verdict(-0.03, -0.02, 0.01) == "worse"
-    assert verdict(math.nan, math.nan, 0.01) == "cannot tell"
 
 
 def test_a_run_cannot_be_told_from_itself(regrets):

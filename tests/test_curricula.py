@@ -130,7 +130,7 @@ def test_without_pay_the_reward_is_minus_the_cost_and_a_failure_has_its_price(na
 
 
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones(constants):
-    constants(OPTIMA=1)
+    constants(OPTIMA=1, REACH=8.0)
     made, task = batch(backwards=True), make_task("turn", duration=8.0)
     run(made, 11)
     starts = made._starts

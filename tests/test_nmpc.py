@@ -6,7 +6,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
-from ballbot_baselines.feedback.horizon import HorizonQp
+from ballbot_baselines.feedback.horizon import horizon_qp
 from ballbot_gym import certified
 from ballbot_gym.robot import Randomization
 from ballbot_gym.rollout import rollout, simulate
@@ -119,8 +119,9 @@ def test_missed_first_exit_goal_is_planned_anew(make_env):
 
 @pytest.mark.parametrize("share", [0.2, 1.0])
 def test_steps_without_a_solution_follow_the_last_plan(make_env, monkeypatch, rng, share):
-    solve = HorizonQp.iterate
-    monkeypatch.setattr(HorizonQp, "iterate", lambda self, margin: rng.random() >= share and solve(self, margin))
+    program = horizon_qp.__wrapped__
+    solve = program.iterate
+    monkeypatch.setattr(program, "iterate", lambda self, margin: rng.random() >= share and solve(self, margin))
     found, run, controller = regret(make_env, Stabilize(), 0, physics="bullet")
     assert run.success
     assert found < 0.01

@@ -7,7 +7,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines.paper import problems
 from ballbot_baselines.paper.collocation import collocation_error, solve
-from ballbot_baselines.paper.problems import PAPER_PROBLEMS, between_states, hermite_guess, state
+from ballbot_baselines.paper.problems import PAPER_PROBLEMS, between_states
 from ballbot_baselines.solvers import guess as guesses
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
@@ -152,18 +152,18 @@ def test_collocation_error_is_the_integral_of_the_residual(params):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_problem_without_a_solution_raises_with_status_and_violation(params, solver):
-    x0 = state(x=-1.0, vy=5.0)
-    hurried = replace(between_states("hurried", x0, state()), step=(0.005, 0.01))  # 0.4 s to stop from 5 m/s
+    entry = PAPER_PROBLEMS["stabilize-5"]
+    hurried = replace(entry.problem, name="hurried", step=(0.005, 0.01))  # 0.4 s to stop from 5 m/s
     with pytest.raises(PlanError, match=rf"hurried: {solver} found no plan: \w+.*violated by \d\.\de[+-]\d\d"):
-        solve(hurried, params, hermite_guess(params, x0, state(), 0.4), solver, max_iterations=60)
+        solve(hurried, params, entry.guess(params), solver, max_iterations=60)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_start_beyond_the_lean_limit_raises_a_plan_error(params, solver):
-    x0 = state(x=-1.0, vy=1.0)
-    x0[2] = 1.2  # the limit is 1
+    entry = PAPER_PROBLEMS["stabilize-1"]
+    x0 = entry.problem.initial[0] + [0, 0, 1.2, 0, 0, 0, 0, 0]  # the limit is 1
     with pytest.raises(PlanError, match="leaning"):
-        solve(between_states("leaning", x0, state()), params, hermite_guess(params, x0, state(), 2.0), solver)
+        solve(replace(entry.problem, name="leaning", initial=(x0, x0)), params, entry.guess(params), solver)
 
 
 def test_guess_along_an_accelerating_path_is_the_motion_itself(params):

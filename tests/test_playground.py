@@ -25,7 +25,7 @@ from ballbot_train.policy.files import BEST, SHIPPED, PolicyError, PolicySpec, s
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 from ballbot_train.policy.printed import javascript_function
 from ballbot_train.report import playground
-from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
+from ballbot_train.report.playground import SCENARIOS, engine_script, playground_page
 
 CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
 FLOAT32 = 2e-5  # with Python's policy in single precision; measured: 5e-6
@@ -208,7 +208,9 @@ def test_the_way_to_the_goal_leads_along_the_optimum_to_its_end_and_never_back(e
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    return write_playground(tmp_path_factory.mktemp("page") / "playground.html")
+    path = tmp_path_factory.mktemp("page") / "playground.html"
+    path.write_text(playground_page(), encoding="utf-8")
+    return path
 
 
 def test_the_page_is_small_and_loads_nothing(page):
@@ -221,7 +223,7 @@ def test_the_page_is_small_and_loads_nothing(page):
 
 
 def test_the_page_is_the_same_every_time(page, tmp_path):
-    assert write_playground(tmp_path / "again.html").read_text() == page.read_text()
+    assert playground_page() == page.read_text()
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ class _Pattern:
         return self._places[columns[:, :, None], rows[:, None]]
 
 
-class HorizonQp:
+class _HorizonQp:
     """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
 
     Variables are changes δa_0, δx_1, δa_1, s_1, … δx_N: x_0 is known and no variable, inputs a are fractions of the force
@@ -210,7 +210,7 @@ class HorizonQp:
         return np.take_along_axis(margins, least, 1), np.take_along_axis(slopes, least[:, None, :], 2)
 
 
-horizon_qp = lru_cache(maxsize=16)(HorizonQp)
+horizon_qp = lru_cache(maxsize=16)(_HorizonQp)
 """The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
 
 

@@ -127,7 +127,7 @@ def _circular_orbit(name: str, speed: float, radius: float, intervals: int = INT
     )
 
 
-def hermite_guess(
+def _hermite_guess(
     params: Ballbot, x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int = INTERVALS
 ) -> Trajectory:
     """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces; duration in s."""
@@ -162,7 +162,7 @@ def _weave_guess(
     return _along(params, spline(along), x0, x1, duration)
 
 
-def state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> np.ndarray:
+def _state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> np.ndarray:
     """(8,) an upright state with this ball position, m, and velocity, m/s."""
     return np.array([x, y, 0.0, 0.0, vx, vy, 0.0, 0.0])
 
@@ -170,17 +170,17 @@ def state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> n
 def _point_to_point(
     name: str, title: str, figure: str, x0: np.ndarray, x1: np.ndarray, duration: float
 ) -> PaperProblem:
-    guess = partial(hermite_guess, x0=x0, x1=x1, duration=duration)
+    guess = partial(_hermite_guess, x0=x0, x1=x1, duration=duration)
     return PaperProblem(title, figure, between_states(name, x0, x1), guess)
 
 
 def _stabilization(speed: float, figure: str, duration: float) -> PaperProblem:
     title = f"Stabilization from x = −1 m, ẏ = {speed:g} m/s"
-    return _point_to_point(f"stabilize-{speed:g}", title, figure, state(x=-1.0, vy=speed), state(), duration)
+    return _point_to_point(f"stabilize-{speed:g}", title, figure, _state(x=-1.0, vy=speed), _state(), duration)
 
 
 def _turn(speed: float, figure: str, duration: float) -> PaperProblem:
-    x0, x1 = state(y=-1.0, vy=speed), state(x=1.0, vx=speed)
+    x0, x1 = _state(y=-1.0, vy=speed), _state(x=1.0, vx=speed)
     return _point_to_point(f"turn-{speed:g}", f"90° turn at {speed:g} m/s", figure, x0, x1, duration)
 
 
@@ -191,7 +191,7 @@ def _orbit(speed: float, figure: str, radius: float) -> PaperProblem:
 
 
 def _weave(figure: str) -> PaperProblem:
-    x0, x1 = state(), state(x=6.0)
+    x0, x1 = _state(), _state(x=6.0)
     obstacles = ((1.5, 0.25, 0.6), (3.0, -0.25, 0.6), (4.5, 0.25, 0.6))
     via = tuple((x, y - np.sign(y) * (distance + 0.1)) for x, y, distance in obstacles)
     return PaperProblem(

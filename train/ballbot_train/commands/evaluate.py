@@ -22,7 +22,6 @@ from ballbot_train.work.console import (
     check_least,
     console,
     physics_or_default,
-    print_rows,
     print_table,
     progress_bars,
 )
@@ -191,6 +190,6 @@ def _print(result: Any, worst: Sequence[dict[str, Any]]) -> None:
         for entry in sorted(weak, key=lambda entry: entry["success"])[:_SHOWN_BINS]
     ]
     if rows:
-        print_rows("", rows)
+        print_table("", [*rows[0]], [[*row.values()] for row in rows])
     rows = [[str(entry["episode"]), entry["replay"], entry["failed"] or "–", f"{entry['cost']:.1f}"] for entry in worst]
     print_table("", ["worst", "look at it with", "failed", "cost"], rows)

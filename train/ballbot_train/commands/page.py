@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from ballbot_gym import files
 from ballbot_train.work.console import console
 
 
@@ -12,7 +13,7 @@ def page(policies: tuple[str, ...] = (), /, out: Path = Path("runs/page/playgrou
         policies: policy files; each replaces the shipped policy of its task on the page.
         out: path of the page.
     """
-    from ballbot_train.report.playground import write_playground  # it imports casadi
+    from ballbot_train.report.playground import playground_page  # it imports casadi
 
-    written = write_playground(out, policies)
+    written = files.write(out, playground_page(policies))
     console.print(f"page: {written}, {written.stat().st_size / 1e6:.2f} MB; open it in a browser")

@@ -18,7 +18,7 @@ from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.robot import default_params
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.report import figures, labels
-from ballbot_train.work.console import check_names, console, physics_or_default, print_rows
+from ballbot_train.work.console import check_names, console, physics_or_default, print_table
 
 _GREY = (0.75, 0.75, 0.75, 1.0)
 
@@ -58,7 +58,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
                 "status": plan.solver_status,
             }
         )
-    print_rows("The paper's problems: 40 intervals, Hermite–Simpson", rows)
+    print_table("The paper's problems: 40 intervals, Hermite–Simpson", [*rows[0]], [[*row.values()] for row in rows])
     stabilizations = [name for name in only or PAPER_PROBLEMS if name.startswith("stabilize")]
     if stabilizations:
         _compare_stabilizations(stabilizations, out, simulator)
@@ -90,7 +90,9 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
         title = f"{entry.figure}: {entry.title}, LQR against trajectory optimization"
         figure = figures.trajectory_figure(title, takes)
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}-lqr-and-trajopt.png")
-    print_rows(f"Stabilization in {simulator}, both with Stabilize's weights", rows)
+    print_table(
+        f"Stabilization in {simulator}, both with Stabilize's weights", [*rows[0]], [[*row.values()] for row in rows]
+    )
 
 
 def _paper_markers(entry: PaperProblem, plan: Optimum) -> list[Marker]:

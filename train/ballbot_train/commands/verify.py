@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ballbot_train.evaluation import submissions
-from ballbot_train.work.console import console, print_rows
+from ballbot_train.work.console import console, print_table
 
 
 def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
@@ -32,21 +32,19 @@ def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
 def print_entries(entries: Sequence[submissions.Entry]) -> None:
     """Prints rows of the leaderboard as a table."""
     if entries:
-        print_rows(
-            "verified",
-            [
-                {
-                    "task": entry.task,
-                    "name": entry.name,
-                    "robot": entry.robot,
-                    "physics": entry.physics,
-                    "success": f"{entry.success:.1%}",
-                    "falls": f"{entry.falls}/{len(entry.costs)}",
-                    "regret mean": entry.shown_regret,
-                }
-                for entry in entries
-            ],
-        )
+        rows = [
+            {
+                "task": entry.task,
+                "name": entry.name,
+                "robot": entry.robot,
+                "physics": entry.physics,
+                "success": f"{entry.success:.1%}",
+                "falls": f"{entry.falls}/{len(entry.costs)}",
+                "regret mean": entry.shown_regret,
+            }
+            for entry in entries
+        ]
+        print_table("verified", [*rows[0]], [[*row.values()] for row in rows])
     known = submissions.read_entries() if entries else []
     for entry in entries:
         if of := entry.copies(known):

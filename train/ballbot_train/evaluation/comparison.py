@@ -19,7 +19,7 @@ import numpy as np
 
 from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_train.evaluation.results import Result
-from ballbot_train.evaluation.statistics import CONFIDENCE, interval, verdict
+from ballbot_train.evaluation.statistics import CONFIDENCE, interval
 
 MARGIN = 0.001
 """Of regret and of success: PyBullet and the model of the optimum differ by as much."""
@@ -165,10 +165,17 @@ def _judge(
     if len(wins) < _FEWEST:
         return "cannot tell", f"{len(wins)} episodes are too few"
     won, lost = int(np.sum(wins > 0)), int(np.sum(wins < 0))
-    by_success = verdict(*success, margin)
+    by_success = _verdict(*success, margin)
     if by_success != "cannot tell" and stats.binomtest(won, won + lost).pvalue < 1 - CONFIDENCE:
         return by_success, f"succeeds in {won} episodes where A does not, A in {lost} where it does not"
-    by_regret = verdict(-regret[1], -regret[0], margin) if standing >= _FEWEST else "cannot tell"
+    by_regret = _verdict(-regret[1], -regret[0], margin) if standing >= _FEWEST else "cannot tell"
     if by_regret != "cannot tell":
         return by_regret, f"regret, over {standing} episodes"
     return "cannot tell", f"no difference beyond {margin:.1%} is sure"
+
+
+def _verdict(low: float, high: float, margin: float) -> str:
+    """What the interval of a difference says where more is better; differences up to the margin decide nothing."""
+    if low > margin:
+        return "better"
+    return "worse" if high < -margin else "cannot tell"

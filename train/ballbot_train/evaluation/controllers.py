@@ -298,10 +298,9 @@ class Predictor:
         self._model, self._state, self.history = model, None, 0
         self._takes = _keywords(model.predict)
         if hasattr(model, "observation_space"):
-            from ballbot_train.policy.saved_models import check_spaces, history_of  # it imports torch
+            from ballbot_train.policy.saved_models import check_spaces  # it imports torch
 
-            self.history = 0 if counterpart else history_of(model, task, params)
-            check_spaces(type(model).__name__, model, task, params, counterpart)
+            self.history = check_spaces(type(model).__name__, model, task, params, counterpart)
         normalization = getattr(model, "get_vec_normalize_env", lambda: None)()
         # only on-policy algorithms leave this empty where there was no VecNormalize
         if normalization is None and hasattr(model, "gae_lambda") and model._last_original_obs is not None:

@@ -74,7 +74,8 @@ class RegretWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._return += float(reward)
         if (terminated or truncated) and self._start is not None:
-            cost = optimal_cost(self._task, self._robot, *self._start)
+            start = (np.asarray(part, np.float64).tobytes() for part in self._start)
+            cost = _optimal_cost(self._task, self._robot, *start)
             if np.isfinite(cost):
                 best = self._task.survival_pay - cost
                 gap = best - self._return
@@ -82,16 +83,11 @@ class RegretWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
 
-def optimal_cost(task: Task, params: Robot, x: np.ndarray, c: np.ndarray) -> float:
-    """The cost of the optimum from state x (n,) with constants c (nc,), from the user's cache or by `find_optimum`; NaN where
-    none is found.
-    """
-    x, c = (np.asarray(part, np.float64) for part in (x, c))
-    return _optimal_cost(task, params, x.tobytes(), c.tobytes())
-
-
 @lru_cache(maxsize=100_000)
 def _optimal_cost(task: Task, params: Robot, x: bytes, c: bytes) -> float:
+    """The cost of the optimum from state x (n,) with constants c (nc,), as bytes, from the user's cache or by `find_optimum`;
+    NaN where none is found.
+    """
     state, constants = np.frombuffer(x), np.frombuffer(c)
     known = _certified(task, params)
     if (cost := known.get((x, c))) is not None:
@@ -123,25 +119,22 @@ def _certified(task: Task, params: Robot) -> dict[tuple[bytes, bytes], float]:
     return {(x.tobytes(), c.tobytes()): float(cost) for x, c, cost in rows}
 
 
-def counterpart_of(task: Any) -> str:
-    """The id of the counterpart, where a task is named by it; else ""."""
-    return task if isinstance(task, str) and any(task == kind.counterpart for kind in TASKS.values()) else ""
-
-
-def translated(policy: Any, id: str, task: Task, params: Robot) -> Any:
+def translated(policy: Any, named: str | Task, task: Task, params: Robot) -> Any:
     """A policy for a counterpart as one for the task: a function of the observation whose actions are in [−1, 1].
 
     Args:
         policy: a model with `predict` that was trained on the counterpart, a function from its observations to its actions,
             or a model saved by Stable-Baselines3. Controllers, and other names, are returned as they are.
-        id: of the counterpart.
-        task: whose counterpart it is.
+        named: how the task was named: by the id of its counterpart, or else the policy is returned as it is.
+        task: the same as an object.
         params: its robot.
 
     Raises:
         ValueError: a model was trained in other spaces than those of the counterpart.
     """
-    env = gymnasium.make(id)
+    if not isinstance(named, str) or all(named != kind.counterpart for kind in TASKS.values()):
+        return policy
+    env = gymnasium.make(named)
     own: Any = env.observation_space, env.action_space
     high = own[1].high
     env.close()

@@ -112,8 +112,7 @@ def evaluate(
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = range(checked_episodes(episodes))
-        if counterpart := counterparts.counterpart_of(task):
-            policy = counterparts.translated(policy, counterpart, env.task, env.params)
+        policy = counterparts.translated(policy, task, env.task, env.params)
         controller = as_controller(policy, env.task, env.params, filter)
         if getattr(controller, "senses", False):
             env.close()

@@ -37,6 +37,11 @@ class _Stress:
     levels: tuple[float, ...]
     at: Callable[[float], Randomization]
 
+    @property
+    def choices(self) -> tuple[float, float, float]:
+        """The least and the greatest severity to choose from by hand, twice the table's, and a step; 0 is none."""
+        return 2 * min(0.0, *self.levels), 2 * max(self.levels), min(map(abs, self.levels))
+
 
 def _both(value: float) -> tuple[float, float]:
     """A range of one value."""

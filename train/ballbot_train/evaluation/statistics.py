@@ -1,13 +1,10 @@
-"""How sure a mean is, and whether one result is better than another."""
+"""How sure a mean is."""
 
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
-from typing import Literal
 
 import numpy as np
-
-Verdict = Literal["better", "worse", "cannot tell"]
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
@@ -66,12 +63,3 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
     middle = (share + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(share * (1 - share) / total + spread / (4 * total))
     return (0.0 if count == 0 else middle - half), (1.0 if count == total else middle + half)
-
-
-def verdict(low: float, high: float, margin: float) -> Verdict:
-    """What the interval of a difference says where more is better; differences up to the margin decide nothing."""
-    if low > margin:
-        return "better"
-    if high < -margin:
-        return "worse"
-    return "cannot tell"

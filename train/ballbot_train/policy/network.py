@@ -29,7 +29,7 @@ from ballbot_train.policy.files import (
     paths_of,
     read_description,
 )
-from ballbot_train.policy.weights import checked, linear_layers, own_precision
+from ballbot_train.policy.weights import checked, linear_layers
 
 with imports_of(__name__):
     import safetensors
@@ -248,7 +248,8 @@ class PolicyController(ActionController):
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
         """Actions (..., 2) for observations (..., no); the other arguments are SB3's and have no effect."""
-        with own_precision(), torch.inference_mode():
+        # in its own precision, also where the caller has switched on automatic casts
+        with torch.autocast("cpu", enabled=False), torch.inference_mode():
             given = torch.as_tensor(np.array(observation), dtype=torch.float32, device="cpu")
             return self.network(given).numpy(), state
 

@@ -79,16 +79,19 @@ def mark(space: spaces.Space, task: Task, params: Robot) -> None:
 
 def check_spaces(
     name: str, model: Any, task: Task, params: Robot, counterpart: tuple[spaces.Box, spaces.Box] | None = None
-) -> None:
+) -> int:
     """Refuses a model that was trained in other spaces, as behind a wrapper that rescales, stacks or converts.
 
     Its `observation_space` and `action_space` are compared with the env's, if it has them, and so is its `mark`. The spaces
     of a `counterpart` of the task may be given instead of the env's.
 
+    Returns:
+        The number of earlier observations and actions that the model observes.
+
     Raises:
         PolicyError: they differ; the message says what to evaluate instead.
     """
-    history = 0 if counterpart else history_of(model, task, params)
+    history = 0 if counterpart else _history_of(model, task, params)
     if (
         getattr(getattr(model, "observation_space", None), _MARK, observed := observation_digest(task, params))
         != observed
@@ -114,9 +117,10 @@ def check_spaces(
                 "wrapper changed them, give ballbot_train.evaluate a function that does what the wrapper did, for "
                 "RescaleAction to ±350: lambda observation: model.predict(observation, deterministic=True)[0] / 350"
             )
+    return history
 
 
-def history_of(model: Any, task: Task, params: Robot) -> int:
+def _history_of(model: Any, task: Task, params: Robot) -> int:
     """The number of earlier observations and actions that a model observed, by the size of its observations; else 0.
 
     `check_spaces` refuses other spaces of this size.
@@ -179,18 +183,17 @@ def load_actor(
             f"{path} takes {model.observations} observations and gives {actions} actions; {task.id} has {size} and "
             f"{params.action_size}"
         )
-    check_spaces(str(path), model, task, params, counterpart)
+    history = check_spaces(str(path), model, task, params, counterpart)
     widths = (size, *(len(bias) for _, bias in model.layers))
     network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
     for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-    history = 0 if counterpart else history_of(model, task, params)
     return _SavedActor(network, model.squashed, history, counterpart[1].high if counterpart else 1.0).eval()
 
 
 def _size(model: _Saved, task: Task, params: Robot) -> int:
     """Numbers that an env shows to a model, with the history that the model was trained with."""
-    (size,) = observation_space(task, params, history_of(model, task, params)).shape
+    (size,) = observation_space(task, params, _history_of(model, task, params)).shape
     return size
 
 

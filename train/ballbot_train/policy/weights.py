@@ -21,11 +21,6 @@ with imports_of(__name__):
 _LARGEST = 1e6  # far above any trained weight, and low enough for sums of their products in float32
 
 
-def own_precision() -> torch.autocast:
-    """Within it a policy computes in its own precision, also where the caller has switched on automatic casts."""
-    return torch.autocast("cpu", enabled=False)
-
-
 @contextmanager
 def own_defaults() -> Iterator[None]:
     """Within it torch is as learners take it, whatever the caller has set: float32 on the CPU, with gradients."""
@@ -34,7 +29,8 @@ def own_defaults() -> Iterator[None]:
     try:
         # a default device slows every call of torch, so it is set only where there is another
         device = nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu")
-        with device, own_precision(), torch.inference_mode(False), torch.enable_grad():
+        without_casts = torch.autocast("cpu", enabled=False)
+        with device, without_casts, torch.inference_mode(False), torch.enable_grad():
             yield
     finally:
         torch.set_default_dtype(kind)

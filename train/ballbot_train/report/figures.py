@@ -74,6 +74,7 @@ def trajectory_figure(
     path.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
     path.grid(alpha=0.3)
     path.legend(fontsize=9, loc="best")
+    _plain(figure)
     return figure
 
 
@@ -98,6 +99,7 @@ def _components_figure(title: str, takes: Sequence[Take], robot: Robot) -> Figur
     axes[len(shown) - 1].set_xlabel("time, s")
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
+    _plain(figure)
     return figure
 
 
@@ -192,13 +194,13 @@ def basin_figure(maps: Sequence[BasinMap], ways: Mapping[str, str] = {}) -> Figu
 
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure as a PNG."""
-    plain(figure)
+    _plain(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return files.write(path, buffer.getvalue())
 
 
-def plain(figure: Figure) -> None:
+def _plain(figure: Figure) -> None:
     """Shows dollar signs as they are: a name is no formula, and one that is half a formula cannot be drawn."""
     for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
         if axis.get_scale() != "linear":  # these ticks are labelled by formulas

@@ -20,7 +20,7 @@ from ballbot_gym.robot import tilt as tilt_of
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.report import labels
-from ballbot_train.report.simulation import Playground, Runner, Start, failure_word, severities
+from ballbot_train.report.simulation import Playground, Runner, Start
 
 PATIENCE = 0.1
 """s of lag that is caught up. A longer lag, for instance of a planner, is not."""
@@ -175,7 +175,7 @@ class PlayPage:
                     stress.label,
                     partial(playground.set_plant, name),
                     partial(playground.plant.get, name),
-                    limits=severities(name),
+                    limits=stress.choices,
                     group=_HIDDEN,
                 )
                 for name, stress in STRESSES.items()
@@ -235,7 +235,7 @@ class PlayPage:
     def _row(self, runner: Runner, color: str) -> dict[str, Any]:
         """A row of the page's table."""
         tilt, peak = (f"{math.degrees(angle):.0f}°" for angle in (tilt_of(runner.x), runner.peak))
-        end = failure_word(runner.violated)
+        end = runner.failed
         if runner.arrived and math.isfinite(self.playground.optimum_cost):
             end = f"regret {100 * (runner.cost / self.playground.optimum_cost - 1):.1f} %"
         return {

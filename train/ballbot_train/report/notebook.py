@@ -41,7 +41,6 @@ def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Rob
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
     """See `ballbot_gym.trajectory.Moving.plot`."""
     figure = figures.trajectory_figure("", _takes(shown, names), _markers(shown))
-    figures.plain(figure)
     if _in_notebook():  # so that it shows figures as pictures, also those that pyplot did not make
         import_module("matplotlib_inline.backend_inline")
     return figure

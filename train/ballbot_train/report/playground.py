@@ -17,7 +17,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import LqrController
-from ballbot_gym import certified, drawing, files
+from ballbot_gym import certified, drawing
 from ballbot_gym.drawing import page
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import TRACKS, Randomization, Robot, default_params, substeps_for
@@ -86,27 +86,22 @@ SCENARIOS = (
 """Every scenario of the page."""
 
 
-def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
-    """Writes the page.
+def playground_page(policies: Sequence[str] = (), live: bool = False) -> str:
+    """The page as HTML.
 
     Args:
-        path: of the HTML file.
         policies: files of policies, each shown instead of the shipped one of its task.
+        live: see `page_html`.
 
     Raises:
         PolicyError: a file is no policy, or that of one that sees more than the present observation.
         ValueError: a policy is of no registered task, two are of one task, or the page would be larger than `LARGEST`.
     """
-    text = playground_page(policies)
+    text = page.page_html(engine_script(policies), asset("playground.js"), live)
     size = len(text.encode())
     if size > LARGEST:
         raise ValueError(f"the page would have {size / 1e6:.2f} MB, and at most {LARGEST / 1e6:g} MB load at once")
-    return files.write(path, text)
-
-
-def playground_page(policies: Sequence[str] = (), live: bool = False) -> str:
-    """The page as HTML; `live` as for `page_html`. Errors: see `write_playground`."""
-    return page.page_html(engine_script(policies), asset("playground.js"), live)
+    return text
 
 
 def engine_script(policies: Sequence[str] = ()) -> str:

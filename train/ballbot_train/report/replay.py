@@ -73,13 +73,8 @@ class Replay:
         if take.slip is not None:
             slips = np.flatnonzero((take.slip > LEAST_SLIP) & (driven.t[1:] <= t))
             skids = (GroundPath(driven.x[i : i + 2, :2], SKID) for i in slips)
-        paths = GroundPath(driven_path(driven, t), take.color), *skids
+        paths = GroundPath(driven.path_until(t), take.color), *skids
         return Drawing(self.params, (Drawn(take.trajectory.state(t), take.color, u),), paths, self.markers)
-
-
-def driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
-    """(n, 2) the ground path until time t, m."""
-    return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
 
 
 def certified_replay(

@@ -40,12 +40,6 @@ Start = int | Literal["rest", "random"]
 """The index of a certified episode, one that stands at the origin until it is pushed, or one with another start."""
 
 
-def severities(stress: str) -> tuple[float, float, float]:
-    """The least and the greatest severity of one of `STRESSES` to choose from, twice the table's, and a step; 0 is none."""
-    levels = STRESSES[stress].levels
-    return 2 * min(0.0, *levels), 2 * max(levels), min(map(abs, levels))
-
-
 class _World:
     """A task for a robot, and what can be chosen there."""
 
@@ -95,6 +89,11 @@ class Runner:
     def force(self) -> tuple[float, ...]:
         """(m,) the last force, N."""
         return self.forces[-1] if self.forces else (0.0,) * self.env.params.action_size
+
+    @property
+    def failed(self) -> str:
+        """How it failed, in words; "" while it has not."""
+        return _failure_word(self.violated)
 
     @property
     def stands_still(self) -> bool:
@@ -161,7 +160,7 @@ class _Score(NamedTuple):
         """In words."""
         regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %"
         if self.failure:
-            return f"{self.controller}: {failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
+            return f"{self.controller}: {_failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
         return f"{self.controller}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
 
 
@@ -262,7 +261,7 @@ class Playground:
         for i, runner in reversed(list(enumerate(self.runners))):
             alpha = GHOST_OPACITY if i else 1.0
             force = np.array(runner.force) if runner is main and not main.violated else None
-            said = failure_word(runner.violated) or f"{math.degrees(tilt(runner.x)):.0f}°"
+            said = runner.failed or f"{math.degrees(tilt(runner.x)):.0f}°"
             label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
             robots.append(Drawn(np.array(runner.x), colors[i], force, alpha, push, label))
             trace = np.array(runner.states[:-_TRACE_STEPS:-_TRACE_EVERY])[:, :2]
@@ -338,9 +337,9 @@ class Playground:
         self.restart()
 
     def set_plant(self, stress: str, value: float) -> None:
-        """Changes what the controllers do not know, for every robot. The value is one of `severities`."""
+        """Changes what the controllers do not know, for every robot. The value is one of the choices of `STRESSES`."""
         check_names("change", [stress], STRESSES)
-        low, high, step = severities(stress)
+        low, high, step = STRESSES[stress].choices
         if not low <= value <= high:
             raise ValueError(f"{stress} must be {low:g} to {high:g}, not {value:g}")
         before = self.plant[stress]
@@ -429,7 +428,7 @@ class Playground:
             self._begin((np.array(main.x), self.start[1]), "random")
 
 
-def failure_word(limit: str) -> str:
+def _failure_word(limit: str) -> str:
     """What a violated limit means, in words; "" for none."""
     return {
         "": "",

@@ -173,11 +173,6 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
     console.print(table)
 
 
-def print_rows(title: str, rows: Sequence[Mapping[str, str]]) -> None:
-    """Prints rows, at least one, whose keys are the header."""
-    print_table(title, list(rows[0]), [list(row.values()) for row in rows])
-
-
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The same as a Markdown table; cells are text."""
     lines = [header, ["---"] * len(header), *rows]
