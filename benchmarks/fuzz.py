@@ -178,8 +178,8 @@ def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ..
     from ballbot_train.work import jobs
 
     config, name = {"episodes": 3, "policies": {"a": "b"}}, "config.json"
-    jobs.claim(folder, config, name)
-    return [folder / name], lambda: jobs.claim(folder, config, name), (ValueError,)
+    jobs.RunFolder(folder, name).claim(config)
+    return [folder / name], lambda: jobs.RunFolder(folder, name).claim(config), (ValueError,)
 
 
 def _entries(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
@@ -214,7 +214,7 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type
     run.save()
 
     def resume() -> None:
-        jobs.unlock(folder / "run")
+        jobs.RunFolder(folder / "run").unlock()
         training._Run(
             apg.Apg(task, default_params(), settings),
             task,

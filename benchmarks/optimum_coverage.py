@@ -101,7 +101,7 @@ def main(
         out: folder of the results; an interrupted run continues here.
         workers: processes.
     """
-    jobs.claim(out, {"draws": draws, "exhaustive": exhaustive_episodes, "tasks": tasks, "seed": seed})
+    jobs.RunFolder(out).claim({"draws": draws, "exhaustive": exhaustive_episodes, "tasks": tasks, "seed": seed})
     studies = ((planned, draws), (searched, exhaustive_episodes))
     work = [
         jobs.Job(
@@ -137,7 +137,7 @@ def main(
             print(
                 f"{name}: exhaustive search gains more than 0.1 % in {(gaps > _IMPROVED).sum()} of {len(gaps)} episodes"
             )
-    jobs.release(out)
+    jobs.RunFolder(out).release()
 
 
 def _row(name: str, entries: Sequence[jobs.Entry]) -> dict[str, object]:

@@ -509,7 +509,7 @@ EVALUATION = [
     (lambda f: evaluate("mine.zip"), "mine.zip: no such file"),
     (lambda f: controllers_of([]), "give at least one task"),
     (lambda f: controllers_of(["turn"], ["lqr", "lqr"]), "controller lqr is given more than once"),
-    (written("{", lambda path: jobs.claim(path.parent, {}, path.name), "config.json"), "is damaged"),
+    (written("{", lambda path: jobs.RunFolder(path.parent, path.name).claim({}), "config.json"), "is damaged"),
 ]
 
 GROUPS = {

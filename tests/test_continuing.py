@@ -99,8 +99,8 @@ def test_the_part_of_a_problem_that_changed_is_named(change: str, tmp_path: Path
 
 def claim_of_benchmark(out: Path) -> None:
     open_run(out, 1, {"paper": {"stabilize": ["lqr"]}}, episodes=5)
-    jobs.unfinished(out).mkdir(exist_ok=True)
-    (jobs.unfinished(out) / "job.json").write_text("[]")
+    jobs.RunFolder(out).unfinished.mkdir(exist_ok=True)
+    (jobs.RunFolder(out).unfinished / "job.json").write_text("[]")
 
 
 def claim_of_training(out: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_run_is_not_continued_with_another_cost_or_another_robot(
     monkeypatch.setattr(training._Run, "measure", lambda run, count: None)
     claim(tmp_path)
     claim(tmp_path)
-    jobs.unlock(tmp_path)
+    jobs.RunFolder(tmp_path).unlock()
     with monkeypatch.context() as patch:
         patch.setitem(TASKS, "stabilize", Dearer)
         with pytest.raises(ValueError, match=r"another problem.*: its costs have changed since"):
@@ -140,7 +140,7 @@ def test_a_run_is_not_continued_with_another_cost_or_another_robot(
         patch.setitem(ROBOTS, "paper", Registered(replace(PAPER, body_mass=14.0), {}))
         with pytest.raises(ValueError, match=r"another problem.*: its robot has changed since"):
             claim(tmp_path)
-    jobs.unlock(tmp_path)
+    jobs.RunFolder(tmp_path).unlock()
 
 
 def test_a_run_is_not_continued_after_its_urdf_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,9 +153,9 @@ def test_a_run_is_not_continued_after_its_urdf_was_edited(tmp_path: Path, monkey
                 open_run(tmp_path / "run", 1, chosen, "mine", episodes=5)
             break
         open_run(tmp_path / "run", 1, chosen, "mine", episodes=5)
-        jobs.unfinished(tmp_path / "run").mkdir()
-        (jobs.unfinished(tmp_path / "run") / "job.json").write_text("[]")
-        jobs.unlock(tmp_path / "run")
+        jobs.RunFolder(tmp_path / "run").unfinished.mkdir()
+        (jobs.RunFolder(tmp_path / "run").unfinished / "job.json").write_text("[]")
+        jobs.RunFolder(tmp_path / "run").unlock()
 
 
 @pytest.mark.parametrize("part", ["weights", "description"])
@@ -164,8 +164,8 @@ def test_a_run_is_not_continued_with_another_policy_in_the_same_file(part: str, 
     path, out = save_policy(tmp_path / "policy", PolicyNetwork(spec), {}), tmp_path / "out"
     chosen = {"paper": {"stabilize": [str(path)]}}
     open_run(out, 1, chosen, episodes=5)
-    jobs.unfinished(out).mkdir()
-    (jobs.unfinished(out) / "job.json").write_text("[]")
+    jobs.RunFolder(out).unfinished.mkdir()
+    (jobs.RunFolder(out).unfinished / "job.json").write_text("[]")
     open_run(out, 1, chosen, episodes=5)
     if part == "weights":
         save_policy(path, PolicyNetwork(spec), {})
@@ -175,7 +175,7 @@ def test_a_run_is_not_continued_with_another_policy_in_the_same_file(part: str, 
         path.write_text(json.dumps(document))
     with pytest.raises(ValueError, match=rf"the policy stabilize/.*policy\.json, whose {part} ha(s|ve) changed since"):
         open_run(out, 1, chosen, episodes=5)
-    jobs.unlock(out)
+    jobs.RunFolder(out).unlock()
 
 
 EARLIER: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], str]] = {

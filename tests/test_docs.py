@@ -18,7 +18,7 @@ from ballbot_train.commands import COMMANDS
 from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.submissions import read_entries
 from ballbot_train.learning import model_free, training
-from ballbot_train.policy.files import SHIPPED, shipped_ways, weights_digest
+from ballbot_train.policy.files import SHIPPED, PolicyFile, shipped_ways
 from ballbot_train.report import figures
 from ballbot_train.work.executors import Workers
 
@@ -218,11 +218,11 @@ def test_the_readme_s_results_are_rows_of_the_leaderboard():
 
 def test_rows_and_policies_say_by_which_learners_they_came():
     assert (
-        shipped_ways()[weights_digest(SHIPPED / "stabilize-ppo.json")] == "dagger → shac → ppo"
+        shipped_ways()[PolicyFile(SHIPPED / "stabilize-ppo.json").weights_digest()] == "dagger → shac → ppo"
     )  # demonstrations of shac count
-    assert shipped_ways()[weights_digest(SHIPPED / "turn-shac.json")] == "dagger → shac → ppo → shac"
-    assert shipped_ways()[weights_digest(SHIPPED / "weave-dagger.json")] == "dagger"
-    assert shipped_ways()[weights_digest(SHIPPED / "stabilize-omni_strong-shac.json")] == "shac"
+    assert shipped_ways()[PolicyFile(SHIPPED / "turn-shac.json").weights_digest()] == "dagger → shac → ppo → shac"
+    assert shipped_ways()[PolicyFile(SHIPPED / "weave-dagger.json").weights_digest()] == "dagger"
+    assert shipped_ways()[PolicyFile(SHIPPED / "stabilize-omni_strong-shac.json").weights_digest()] == "shac"
     entries = [entry for entry in read_entries() if entry.name in ("dagger", "shac", "sac", "ppo")]
     assert entries
     assert all(shipped_ways()[entry.policy].endswith(entry.name) for entry in entries)

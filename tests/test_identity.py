@@ -15,7 +15,7 @@ from ballbot_gym.tasks.identity import observation_digest, problem_digest
 from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.runner import open_run
-from ballbot_train.policy.files import PolicyError, PolicySpec, read_description
+from ballbot_train.policy.files import PolicyError, PolicyFile, PolicySpec
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 from ballbot_train.work import jobs
 
@@ -149,14 +149,14 @@ def test_every_task_of_every_robot_is_a_problem_of_its_own(robot: str) -> None:
 def test_a_run_continues_with_the_same_problem_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = {"paper": {"stabilize": ["lqr"]}}
     open_run(tmp_path, 1, chosen, episodes=5)
-    unfinished = jobs.unfinished(tmp_path)
+    unfinished = jobs.RunFolder(tmp_path).unfinished
     unfinished.mkdir(exist_ok=True)
     (unfinished / "job.json").write_text("[]")
     open_run(tmp_path, 1, chosen, episodes=5)
     monkeypatch.setitem(TASKS, "stabilize", type(named_as_stabilize(Dearer)))
     with pytest.raises(ValueError, match="another problem stabilize: its costs have changed since"):
         open_run(tmp_path, 1, chosen, episodes=5)
-    jobs.unlock(tmp_path)
+    jobs.RunFolder(tmp_path).unlock()
 
 
 def test_a_policy_is_read_for_the_numbers_of_its_robot_and_not_for_its_name(
@@ -191,7 +191,7 @@ def test_shipped_policies_say_their_robot_and_observation() -> None:
     for robot in ROBOTS:
         for name in TASKS:
             for path in shipped_policies(make_task(name, robot), robot, None).values():
-                spec = PolicySpec.read(read_description(path)["spec"])
+                spec = PolicySpec.read(PolicyFile(path).read()["spec"])
                 assert spec == spec.on(make_task(name, robot), robot)
 
 

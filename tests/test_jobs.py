@@ -95,26 +95,26 @@ def failing(items):
 def test_a_folder_belongs_to_a_run_from_its_first_result_until_it_is_released(tmp_path):
     work = [jobs.Job(f"{i}", failing, (), (i,)) for i in (1, 0)]
     for episodes in (3, 4):
-        jobs.claim(tmp_path, {"episodes": episodes})
+        jobs.RunFolder(tmp_path).claim({"episodes": episodes})
         with pytest.raises(ValueError, match="no episode 1"):
             jobs.run(work, tmp_path, 1, ignore)
     with pytest.raises(ValueError, match="no episode 1"):
         jobs.run(work[::-1], tmp_path, 1, ignore)
-    jobs.claim(tmp_path, {"episodes": 4})
+    jobs.RunFolder(tmp_path).claim({"episodes": 4})
     with pytest.raises(ValueError, match="unfinished run of episodes 4, not 3"):
-        jobs.claim(tmp_path, {"episodes": 3})
-    jobs.release(tmp_path)
+        jobs.RunFolder(tmp_path).claim({"episodes": 3})
+    jobs.RunFolder(tmp_path).release()
     assert not any(tmp_path.iterdir())
-    jobs.claim(tmp_path, {"episodes": 3})
-    jobs.release(tmp_path)
+    jobs.RunFolder(tmp_path).claim({"episodes": 3})
+    jobs.RunFolder(tmp_path).release()
 
 
 def test_the_files_of_a_claim_keep_facts_that_are_not_compared(tmp_path):
-    jobs.claim(tmp_path, {"seed": 1}, "config.json", {"about": {"commit": "a"}})
-    jobs.claim(tmp_path, {"seed": 1}, "config.json", {"about": {"commit": "b"}})
+    jobs.RunFolder(tmp_path, "config.json").claim({"seed": 1}, {"about": {"commit": "a"}})
+    jobs.RunFolder(tmp_path, "config.json").claim({"seed": 1}, {"about": {"commit": "b"}})
     assert json.loads((tmp_path / "config.json").read_text()) == {"seed": 1, "about": {"commit": "b"}}
     with pytest.raises(ValueError, match="seed 1, not 2"):
-        jobs.claim(tmp_path, {"seed": 2}, "config.json", {"about": {}})
+        jobs.RunFolder(tmp_path, "config.json").claim({"seed": 2}, {"about": {}})
 
 
 HOLDING = """
@@ -122,7 +122,7 @@ import sys
 from pathlib import Path
 from ballbot_train.work import jobs
 
-jobs.claim(Path(sys.argv[1]), {"seed": 1})
+jobs.RunFolder(Path(sys.argv[1])).claim({"seed": 1})
 print("claimed", flush=True)
 sys.stdin.readline()
 """
@@ -134,11 +134,11 @@ def test_two_processes_never_use_a_folder_at_once(tmp_path):
     )
     assert other.stdout.readline() == "claimed\n"
     with pytest.raises(ValueError, match=r"another run is using .* right now"):
-        jobs.claim(tmp_path, {"seed": 1})
+        jobs.RunFolder(tmp_path).claim({"seed": 1})
     other.kill()  # what a killed process held is free again
     other.communicate()
-    jobs.claim(tmp_path, {"seed": 1})
-    jobs.release(tmp_path)
+    jobs.RunFolder(tmp_path).claim({"seed": 1})
+    jobs.RunFolder(tmp_path).release()
 
 
 def deadly(log, items):

@@ -11,7 +11,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import named_robot
 from ballbot_train.commands.export import export
 from ballbot_train.policy.export_onnx import export_onnx
-from ballbot_train.policy.files import SHIPPED, PolicySpec, read_description, track_in
+from ballbot_train.policy.files import SHIPPED, PolicyFile, PolicySpec, track_in
 from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
 
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
@@ -45,7 +45,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     export(str(SHIPPED / f"{name}.json"), task=task, out=tmp_path / "policy.onnx", robot=robot)
     runtime = session(tmp_path / "policy.onnx")
     policy = load_policy(SHIPPED / f"{name}.json")
-    history = read_description(SHIPPED / f"{name}.json")["spec"].get("history", 0)
+    history = PolicyFile(SHIPPED / f"{name}.json").read()["spec"].get("history", 0)
     world = {"randomization": track_in(name) or None, "history": history}
     # in the closed form a ball that would slip ends the episode
     physics = default_physics() if named_robot(robot).grips else "rk4"

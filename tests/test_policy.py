@@ -16,7 +16,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train.evaluation.controllers import make_controller, names
 from ballbot_train.evaluation.evaluate import evaluate
-from ballbot_train.policy.files import BEST, PolicyError, PolicySpec, read_description, shipped_policies
+from ballbot_train.policy.files import BEST, PolicyError, PolicyFile, PolicySpec, shipped_policies
 from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
 
 
@@ -123,7 +123,7 @@ def test_a_batch_computes_in_its_own_precision_whatever_torchs_default_is(name, 
 @pytest.mark.parametrize(("name", "robot", "learner"), SHIPPED)
 def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robot, learner):
     """In the first certified episodes they succeed, at a regret of the order that they claim."""
-    described = read_description(shipped_policies(make_task(name, robot), robot)[learner])
+    described = PolicyFile(shipped_policies(make_task(name, robot), robot)[learner]).read()
     assert described["training"]["command"].startswith("ballbot ")
     measured = described["measured"]
     assert measured["physics"] == default_physics()
@@ -136,6 +136,6 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
 
 @pytest.mark.parametrize("name", TASKS)
 def test_pages_show_the_policy_of_the_least_regret(name):
-    described = {learner: read_description(path) for learner, path in shipped_policies(make_task(name)).items()}
+    described = {learner: PolicyFile(path).read() for learner, path in shipped_policies(make_task(name)).items()}
     regrets = {learner: each["measured"]["regret_mean"] for learner, each in described.items()}
     assert BEST[name] == min(regrets, key=regrets.__getitem__)

@@ -29,7 +29,7 @@ from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started
 from ballbot_train.policy.export_onnx import export_onnx
-from ballbot_train.policy.files import PolicyError, read_description, shipped_policies, track_in
+from ballbot_train.policy.files import PolicyError, PolicyFile, shipped_policies, track_in
 from ballbot_train.policy.network import load_network, save_policy
 
 
@@ -79,7 +79,7 @@ SHIPPED = [
 def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
     """It comes with the package, runs on its track alone unless it is named, and does there what it measured."""
     path = shipped_policies(make_task(name), track=track)[learner]
-    described = read_description(path)
+    described = PolicyFile(path).read()
     assert described["training"]["randomization"] == track
     assert learner not in shipped_policies(make_task(name))
     row = evaluate(learner, name, 4, "rk4", randomization=track)

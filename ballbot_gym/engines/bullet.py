@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym.engines.bullet_client import import_pybullet
-from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
+from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State
 from ballbot_gym.robot import omni, urdf_text
 
 _JOINTS = ("x", "y", "gamma", "theta", "psi")  # the last where wheels turn the body
@@ -35,7 +35,7 @@ class BulletSimulator(Simulator):
             ImportError: PyBullet is missing or was built without NumPy.
             RuntimeError: PyBullet has no client left.
         """
-        substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
+        substeps = self._whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         self._bullet = bullet = import_pybullet()
         self._client = bullet.connect(bullet.DIRECT)
         if self._client < 0:
@@ -76,7 +76,7 @@ class BulletSimulator(Simulator):
         self._release()
 
     def _reload(self, params: Any) -> None:
-        check_kind(params, self._params)
+        self._check_kind(params, self._params)
         self._bullet.removeBody(self._robot, physicsClientId=self._client)
         self._load(params)
 
@@ -146,7 +146,7 @@ class BulletContactSimulator(BulletSimulator):
         """Args: as for `BulletSimulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
         super().__init__(params, control_dt, physics_dt)
         bullet, client = self._bullet, self._client
-        self._substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
+        self._substeps = self._whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         self._floor = bullet.createMultiBody(
             0, bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client), physicsClientId=client
         )

@@ -1,6 +1,6 @@
 """The closed form as a simulator. It needs NumPy alone."""
 
-from ballbot_gym.engines.simulator import Simulator, State, check_kind, whole_substeps
+from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.machine_code import step_code
 from ballbot_gym.robot import Robot
 
@@ -12,7 +12,9 @@ class Rk4Simulator(Simulator):
         """Args: as for `BulletSimulator`; physics_dt defaults to `RK4_STEP`."""
         self._params = params
         self._dt = control_dt
-        self._substeps = params.substeps(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
+        self._substeps = (
+            params.substeps(control_dt) if physics_dt is None else self._whole_substeps(control_dt, physics_dt)
+        )
         self._each = range(self._substeps)  # made once: it is a hundredth of a step
         self._x: State = (0.0,) * params.state_size
         self._code: step_code.Work | None = None
@@ -21,7 +23,7 @@ class Rk4Simulator(Simulator):
         self._x = x
 
     def set_params(self, params: Robot) -> None:
-        check_kind(params, self._params)
+        self._check_kind(params, self._params)
         self._params = params
         if self._code is not None:
             self._code.given[-len(params.kind.numbers) :] = params.numbers()

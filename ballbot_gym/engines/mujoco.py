@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
+from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.robot import omni
 
@@ -38,7 +38,7 @@ class MujocoSimulator(Simulator):
         """
         if physics_dt is None:
             physics_dt = control_dt / max(1, np.ceil(control_dt / self._longest - 1e-9))
-        self._substeps = whole_substeps(control_dt, physics_dt)
+        self._substeps = self._whole_substeps(control_dt, physics_dt)
         self._dt = physics_dt
         self._mujoco = import_mujoco()
         self._mj_step = self._mujoco.mj_step
@@ -58,7 +58,7 @@ class MujocoSimulator(Simulator):
             self._positions[place], self._velocities[place] = x[i], x[i + 4]
 
     def set_params(self, params: Any) -> None:
-        check_kind(params, self._params)
+        self._check_kind(params, self._params)
         self._make(params)
 
     def step(self, u: tuple[float, ...]) -> State:

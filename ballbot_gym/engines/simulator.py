@@ -50,25 +50,25 @@ class Simulator(Protocol):
     def close(self) -> None:
         """Releases what the simulator holds; may be called again."""
 
+    @staticmethod
+    def _whole_substeps(control_dt: float, physics_dt: float) -> int:
+        """How many steps of an engine a control step is. Raises a ValueError if that is no whole number of them."""
+        if not is_number(physics_dt):
+            raise ValueError(f"physics_dt must be a number of seconds, not {physics_dt!r}")
+        in_range = control_dt / (_MOST_SUBSTEPS + 0.5) < physics_dt <= 2 * control_dt
+        substeps = round(control_dt / physics_dt) if in_range else 0
+        if substeps < 1 or not math.isclose(substeps * physics_dt, control_dt, rel_tol=1e-9):
+            raise ValueError(
+                f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s, and at least "
+                f"1/{_MOST_SUBSTEPS} of it"
+            )
+        return substeps
 
-def check_kind(params: Robot, own: Robot) -> None:
-    """Raises a ValueError if a robot is of another kind than a simulator's own."""
-    if type(params) is not type(own):
-        raise ValueError(
-            f"this simulator is of a {type(own).__name__}, not of a {type(params).__name__}; make another with "
-            "make_simulator()"
-        )
-
-
-def whole_substeps(control_dt: float, physics_dt: float) -> int:
-    """How many steps of an engine a control step is. Raises a ValueError if that is no whole number of them."""
-    if not is_number(physics_dt):
-        raise ValueError(f"physics_dt must be a number of seconds, not {physics_dt!r}")
-    in_range = control_dt / (_MOST_SUBSTEPS + 0.5) < physics_dt <= 2 * control_dt
-    substeps = round(control_dt / physics_dt) if in_range else 0
-    if substeps < 1 or not math.isclose(substeps * physics_dt, control_dt, rel_tol=1e-9):
-        raise ValueError(
-            f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s, and at least "
-            f"1/{_MOST_SUBSTEPS} of it"
-        )
-    return substeps
+    @staticmethod
+    def _check_kind(params: Robot, own: Robot) -> None:
+        """Raises a ValueError if a robot is of another kind than a simulator's own."""
+        if type(params) is not type(own):
+            raise ValueError(
+                f"this simulator is of a {type(own).__name__}, not of a {type(params).__name__}; make another with "
+                "make_simulator()"
+            )

@@ -44,7 +44,7 @@ def basins(
     made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made, ways), out / "basins.png")
-    jobs.release(out)
+    jobs.RunFolder(out).release()
     header = ["controller", "recovered", *(f"by lean and {basin.axis}" for basin in made)]
     shares = [[maps.fraction(made, name), *(maps.fraction([basin], name) for basin in made)] for name in names]
     rows = [

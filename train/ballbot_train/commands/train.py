@@ -111,11 +111,11 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
 def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, Any]:
     """The record of a run; it also says how the demonstrations, or the policy to start from, were made."""
     from ballbot_train.learning.datasets import command_of
-    from ballbot_train.policy.files import read_description
+    from ballbot_train.policy.files import PolicyFile
 
     inputs = [] if run.demos is None else [command_of(run.demos)]
     if run.start is not None:
-        trained = read_description(run.start).get("training")
+        trained = PolicyFile(run.start).read().get("training")
         if not isinstance(trained, dict) or not isinstance(trained.get("command"), str):
             raise ValueError(
                 f"{run.start} does not say by which command it was trained; give a policy of ballbot train"

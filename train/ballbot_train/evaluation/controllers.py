@@ -17,7 +17,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, ROBOTS, Robot, named_robot, robot_name
 from ballbot_gym.rollout import ActionController, Controller
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_train.policy.files import PolicyError, is_run, read_description, shipped_policies, weights_digest
+from ballbot_train.policy.files import PolicyError, PolicyFile, shipped_policies
 from ballbot_train.work.console import check_names
 
 _SENSORS = "ekf"
@@ -79,7 +79,7 @@ def is_file(name: str) -> bool:
     """Whether a controller's name is the path of a policy file, of a run's folder with one, or of a saved model."""
     alone, _ = split(name)
     path = Path(alone)
-    return not is_expert(name) and (bool(path.suffix) or (path.name != alone and is_run(path)))
+    return not is_expert(name) and (bool(path.suffix) or (path.name != alone and PolicyFile(path).is_run))
 
 
 def _is_saved_model(name: str) -> bool:
@@ -106,7 +106,7 @@ def _is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
         from ballbot_train.policy.saved_models import fits  # it imports torch
 
         return fits(split(name)[0], task, named_robot(robot))
-    spec = read_description(split(name)[0])["spec"]
+    spec = PolicyFile(split(name)[0]).read()["spec"]
     return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
 
@@ -120,7 +120,7 @@ def _made_for(name: str) -> str:
         from ballbot_train.policy.saved_models import read
 
         return f"a task with {read(split(name)[0]).observations} observations"
-    spec = read_description(split(name)[0])["spec"]
+    spec = PolicyFile(split(name)[0]).read()["spec"]
     robot = spec.get("robot", PAPER)
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
@@ -135,7 +135,7 @@ def policy_digest(name: str, task: Task, robot: str | Robot = PAPER) -> str:
     """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
     if is_expert(name):
         return ""
-    return weights_digest(_file_of(name, task, robot if isinstance(robot, str) else robot_name(robot)))
+    return PolicyFile(_file_of(name, task, robot if isinstance(robot, str) else robot_name(robot))).weights_digest()
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
@@ -382,21 +382,21 @@ def controllers_of(
 def policy_digests(
     controllers: Mapping[str, Mapping[str, Sequence[str]]],
     robot: str = PAPER,
-    of: Callable[[str | Path], str] = weights_digest,
+    of: Callable[[PolicyFile], str] = PolicyFile.weights_digest,
 ) -> dict[str, str]:
     """A digest of every learned policy among controllers by robot and task.
 
     Args:
         controllers: as `controllers_of` gives them.
         robot: on which they run, by name.
-        of: what the digest is of, from a policy's file.
+        of: which digest.
 
     Returns:
         The digests under "TASK/NAME", or "ROBOT/TASK/NAME" of policies that were made for another robot.
     """
     return {
         f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(
-            _file_of(name, make_task(task, made_for), made_for)
+            PolicyFile(_file_of(name, make_task(task, made_for), made_for))
         )
         for made_for, by_task in controllers.items()
         for task, group in by_task.items()

@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.results import Result, Row, table_cells, write_results
-from ballbot_train.policy.files import network_digest, shipped_ways, weights_digest
+from ballbot_train.policy.files import PolicyFile, shipped_ways
 from ballbot_train.work import jobs
 from ballbot_train.work.console import check_least, markdown, print_table
 from ballbot_train.work.executors import Workers
@@ -45,7 +45,7 @@ def open_run(
     robot: str = PAPER,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Claims a folder for a run with some settings; `publish` or `jobs.release` ends the run.
+    """Claims a folder for a run with some settings; `publish` or `RunFolder.release` ends the run.
 
     Args:
         out: the folder.
@@ -62,7 +62,8 @@ def open_run(
             process is using it; or the seed is negative.
     """
     check_least(0, seed=settings.get("seed", 0))
-    policies, networks = (registry.policy_digests(chosen, robot, of) for of in (weights_digest, network_digest))
+    digests = PolicyFile.weights_digest, PolicyFile.network_digest
+    policies, networks = (registry.policy_digests(chosen, robot, of) for of in digests)
     problems = {
         task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
         for made_for, by_task in chosen.items()
@@ -80,7 +81,7 @@ def open_run(
     facts["workers"] = Workers.of(workers).here or "a Ray cluster"
     ways = {name: shipped_ways()[found] for name, found in policies.items() if found in shipped_ways()}
     facts |= {"trained_by": ways} if ways else {}
-    jobs.claim(out, {key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
+    jobs.RunFolder(out).claim({key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
     return facts
 
 
@@ -111,7 +112,7 @@ def publish(
     write_results(rows, results, facts, out, name, **more)
     header, table = list(shown), table_cells(shown, rows if lines is None else lines, facts.get("trained_by", {}))
     files.write(out / f"{name}.md", markdown(header, table))
-    jobs.release(out)
+    jobs.RunFolder(out).release()
     print_table(title, header, table)
 
 

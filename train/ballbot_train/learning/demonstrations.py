@@ -47,7 +47,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import controllers
 from ballbot_train.learning.datasets import IN_DATASET, metadata_of
-from ballbot_train.policy.files import OBSERVATION_VERSION, content_digest, shipped_policies
+from ballbot_train.policy.files import OBSERVATION_VERSION, PolicyFile, shipped_policies
 from ballbot_train.work import jobs, shards
 from ballbot_train.work.console import check_names
 from ballbot_train.work.executors import Workers
@@ -202,7 +202,7 @@ def _content(config: DemoConfig) -> dict[str, Any]:
     if controllers.is_expert(config.expert):
         return content
     shipped = shipped_policies(make_task(config.task, config.robot), config.robot)
-    return content | {"expert_policy": content_digest(shipped[config.expert])}
+    return content | {"expert_policy": PolicyFile(shipped[config.expert]).digest()}
 
 
 def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
@@ -235,13 +235,14 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
         shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
         return out
     Workers.of(workers)
-    jobs.claim(unfinished, described, "dataset.json")
+    folder = jobs.RunFolder(unfinished, "dataset.json")
+    folder.claim(described)
     try:
         made = write_shards(config, str(unfinished / "set"), unfinished / "episodes", workers)
         _assemble(config, made, unfinished, out)
         shutil.rmtree(unfinished, ignore_errors=True)
     finally:
-        jobs.unlock(unfinished)
+        folder.unlock()
     return out
 
 

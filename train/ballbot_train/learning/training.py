@@ -56,7 +56,7 @@ from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.results import Row, leaderboard
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
-from ballbot_train.policy.files import content_digest
+from ballbot_train.policy.files import PolicyFile
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 from ballbot_train.policy.weights import own_defaults, saved_by_torch
 from ballbot_train.work import jobs
@@ -197,16 +197,17 @@ def train(
     compared = {name: value for name, value in config.items() if name != "command"}
     compared["problem"] = problem_parts(task, named_robot(run.robot))
     if config.get("start") is not None:
-        compared["start_policy"] = content_digest(config["start"])
+        compared["start_policy"] = PolicyFile(config["start"]).digest()
     if config.get("demos") is not None:
         compared["demonstrations"] = digest(metadata_of(config["demos"]))
-    jobs.claim(out, compared, _CONFIG, {"command": config.get("command"), "about": provenance()})
+    folder = jobs.RunFolder(out, _CONFIG)
+    folder.claim(compared, {"command": config.get("command"), "about": provenance()})
     try:
         run.restore()
         run.learn()
         return run.measure(test_episodes)
     finally:
-        jobs.unlock(out)
+        folder.unlock()
 
 
 class _Run:

@@ -19,7 +19,7 @@ from ballbot_gym import files
 from ballbot_gym.lazy import imports_of, need
 from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.tasks import Task
-from ballbot_train.policy.files import OBSERVATION_VERSION, PolicyError, read_description, weights_digest
+from ballbot_train.policy.files import OBSERVATION_VERSION, PolicyError, PolicyFile
 from ballbot_train.policy.network import PolicyNetwork, load_network
 from ballbot_train.policy.weights import own_defaults
 
@@ -65,7 +65,7 @@ _HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's sp
 
 def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, str]:
     """The metadata of an ONNX file: task, layouts and units of input and output, control rate, and origin of the policy."""
-    described, params = read_description(policy), named_robot(robot)
+    described, params = PolicyFile(policy).read(), named_robot(robot)
     if described["spec"].get("informed"):
         raise PolicyError(
             f"{policy} is informed of its robot by a filter, which cannot be exported; export another policy"
@@ -84,7 +84,7 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
         "force_limit_newton": repr(float(params.force_limit)),
         "control_dt_seconds": repr(task.control_dt),
         "learner": str(learner),
-        "weights_sha256": weights_digest(policy),
+        "weights_sha256": PolicyFile(policy).weights_digest(),
         "ballbot_gym_version": ballbot_gym.__version__,
     }
 

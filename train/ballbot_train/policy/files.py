@@ -176,52 +176,89 @@ class PolicySpec:
         return replace(self, robot=robot, **content)
 
 
-def read_description(path: str | Path) -> dict[str, Any]:
-    """What a policy's JSON file says; its `spec` holds the fields of a PolicySpec.
+@dataclass(frozen=True)
+class PolicyFile:
+    """A policy on disk: weights in `NAME.safetensors` and their description in `NAME.json`; or a saved model, `NAME.zip`."""
 
-    Args:
-        path: of either of the policy's files.
+    path: str | Path
+    """Of either file, the name without an ending, or the folder of a training run."""
 
-    Raises:
-        PolicyError: it is missing or damaged.
-    """
-    _, description = paths_of(path)
-    if Path(path).suffix in (".pt", ".pth", ".ckpt"):
-        raise PolicyError(
-            f"{path} is no policy's .json, nor a model of Stable-Baselines3 in a .zip: load it where it was made, and give "
-            "ballbot_train.evaluate a function from observation to action"
-        )
-    try:
-        read = files.read_json(description, _DESCRIPTION_LIMIT)
-        if not isinstance(read["spec"], dict):
-            raise TypeError("its spec is no object")
-        if not isinstance(read["spec"]["task"], str):
-            raise TypeError("its spec names no task")
-        if not isinstance(read.get("training", {}), dict):
-            raise TypeError("its training is no object")
-    except KeyError as error:
-        raise PolicyError(f"{description} is not a policy: it has no {error}") from error
-    except (ValueError, TypeError) as error:
-        raise PolicyError(f"{description} is not a policy: {error}") from error
-    return read
+    @property
+    def is_run(self) -> bool:
+        """Whether it is the folder of a training run that has a policy."""
+        return (Path(self.path) / "policy.json").is_file()
 
+    @property
+    def weights(self) -> Path:
+        """The path of the weights."""
+        return Path(self.path) if Path(self.path).suffix == ".zip" else self._with(".safetensors")
 
-def _way_of(path: str | Path) -> str:
-    """The whole way of a policy by the record in its file: all learners and demonstrators in turn, as "dagger → shac".
+    @property
+    def description(self) -> Path:
+        """The path of what describes them."""
+        return self._with(".json")
 
-    "" where the record holds no command of `ballbot train`.
-    """
-    training = read_description(path).get("training", {})
-    # "command" trains the policy again by today's options; "made_by" is the original command, if that differs
-    command = str(training.get("made_by") or training.get("command"))
-    names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
-    return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])
+    def _with(self, ending: str) -> Path:
+        path = Path(self.path) / "policy" if self.is_run else Path(self.path)
+        stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
+        return stem.with_name(stem.name + ending)
+
+    def read(self) -> dict[str, Any]:
+        """What the description says; its `spec` holds the fields of a PolicySpec.
+
+        Raises:
+            PolicyError: it is missing or damaged.
+        """
+        if Path(self.path).suffix in (".pt", ".pth", ".ckpt"):
+            raise PolicyError(
+                f"{self.path} is no policy's .json, nor a model of Stable-Baselines3 in a .zip: load it where it was made, "
+                "and give ballbot_train.evaluate a function from observation to action"
+            )
+        try:
+            read = files.read_json(self.description, _DESCRIPTION_LIMIT)
+            if not isinstance(read["spec"], dict):
+                raise TypeError("its spec is no object")
+            if not isinstance(read["spec"]["task"], str):
+                raise TypeError("its spec names no task")
+            if not isinstance(read.get("training", {}), dict):
+                raise TypeError("its training is no object")
+        except KeyError as error:
+            raise PolicyError(f"{self.description} is not a policy: it has no {error}") from error
+        except (ValueError, TypeError) as error:
+            raise PolicyError(f"{self.description} is not a policy: {error}") from error
+        return read
+
+    def way(self) -> str:
+        """The whole way of its training by its own record: all learners and demonstrators in turn, as "dagger → shac".
+
+        "" where the record holds no command of `ballbot train`.
+        """
+        training = self.read().get("training", {})
+        # "command" trains the policy again by today's options; "made_by" is the original command, if that differs
+        command = str(training.get("made_by") or training.get("command"))
+        names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
+        return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])
+
+    def weights_digest(self) -> str:
+        """SHA-256 of the weights, or of a saved model, as hexadecimal digits; raises a PolicyError if they are missing."""
+        try:
+            return hashlib.sha256(files.read(self.weights)).hexdigest()
+        except files.FileError as error:
+            raise PolicyError(f"{self.weights} is not a policy: {error}") from error
+
+    def network_digest(self) -> str:
+        """Digest of the network that the description says; "" of a saved model, whose only file has the weights too."""
+        return "" if Path(self.path).suffix == ".zip" else digest(self.read()["spec"])
+
+    def digest(self) -> str:
+        """Digest of what the policy does: its weights, and the network that its description says."""
+        return digest(self.weights_digest(), self.network_digest())
 
 
 @lru_cache(maxsize=1)
 def shipped_ways() -> Mapping[str, str]:
     """The whole way of each shipped policy, by the SHA-256 of its weights."""
-    return {weights_digest(path): _way_of(path) for path in SHIPPED.glob("*.json")}
+    return {file.weights_digest(): file.way() for file in map(PolicyFile, SHIPPED.glob("*.json"))}
 
 
 def shipped_policies(task: Task, robot: str = PAPER, track: str | None = "") -> dict[str, Path]:
@@ -245,36 +282,3 @@ def track_in(name: str) -> str:
     """The track that a policy's name says it was trained on, or ""."""
     last = name.rpartition("-")[2]
     return last if last in TRACKS else ""
-
-
-def weights_digest(path: str | Path) -> str:
-    """SHA-256 of a policy's weights, or of a saved model, as hexadecimal digits; raises a PolicyError if they are missing."""
-    weights = path if Path(path).suffix == ".zip" else paths_of(path)[0]
-    try:
-        return hashlib.sha256(files.read(weights)).hexdigest()
-    except files.FileError as error:
-        raise PolicyError(f"{weights} is not a policy: {error}") from error
-
-
-def content_digest(path: str | Path) -> str:
-    """Digest of what a policy does: its weights, and the network that its description says."""
-    return digest(weights_digest(path), network_digest(path))
-
-
-def network_digest(path: str | Path) -> str:
-    """Digest of the network that a policy's JSON file describes; "" of a saved model, whose only file has the weights too."""
-    return "" if Path(path).suffix == ".zip" else digest(read_description(path)["spec"])
-
-
-def is_run(path: Path) -> bool:
-    """Whether a path is the folder of a training run that has a policy."""
-    return (path / "policy.json").is_file()
-
-
-def paths_of(path: str | Path) -> tuple[Path, Path]:
-    """The paths of a policy's weights and of its description, given either, the name without an ending, or a run's folder."""
-    path = Path(path)
-    if is_run(path):
-        path = path / "policy"
-    stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
-    return stem.with_name(stem.name + ".safetensors"), stem.with_name(stem.name + ".json")

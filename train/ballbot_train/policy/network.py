@@ -25,9 +25,8 @@ from ballbot_gym.tasks.symmetry import REACH, Route
 from ballbot_train.policy.files import (
     OBSERVATION_VERSION,
     PolicyError,
+    PolicyFile,
     PolicySpec,
-    paths_of,
-    read_description,
 )
 from ballbot_train.policy.weights import checked, linear_layers
 
@@ -265,10 +264,10 @@ def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[s
     Returns:
         The path of the JSON file.
     """
-    weights_path, description_path = paths_of(path)
+    file = PolicyFile(path)
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
-    files.write(weights_path, safetensors.torch.save(weights))
-    return files.write(description_path, json.dumps({"spec": asdict(network.spec), **description}, indent=1) + "\n")
+    files.write(file.weights, safetensors.torch.save(weights))
+    return files.write(file.description, json.dumps({"spec": asdict(network.spec), **description}, indent=1) + "\n")
 
 
 def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> PolicyNetwork:
@@ -282,8 +281,9 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
     Raises:
         PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
     """
-    weights_path, description_path = paths_of(path)
-    described = read_description(path)["spec"]
+    file = PolicyFile(path)
+    weights_path, description_path = file.weights, file.description
+    described = file.read()["spec"]
     try:
         spec = PolicySpec.read(described)
     except (KeyError, ValueError, TypeError) as error:
@@ -362,7 +362,7 @@ def load_policy(path: str | Path, task: str | Task | None = None, params: Robot 
     Raises:
         PolicyError: as `load_network`; or no task is given, and its file names none that is registered.
     """
-    spec = read_description(path)["spec"]
+    spec = PolicyFile(path).read()["spec"]
     robot = spec.get("robot", PAPER) if params is None else robot_name(params)
     if not isinstance(robot, str) or robot not in ROBOTS:
         raise PolicyError(f"{path} was trained on the robot {robot!r}, which is none of {', '.join(ROBOTS)}")

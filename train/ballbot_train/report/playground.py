@@ -24,7 +24,7 @@ from ballbot_gym.robot import TRACKS, Randomization, Robot, default_params, subs
 from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import policy_path, task_name
-from ballbot_train.policy.files import BEST, PolicyError, read_description, shipped_policies
+from ballbot_train.policy.files import BEST, PolicyError, PolicyFile, shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, load_network
 from ballbot_train.policy.printed import javascript_function, layers_of, policy_function
 from ballbot_train.report import labels
@@ -140,7 +140,7 @@ def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
     """The data of a policy, besides the printed functions."""
     if network.spec.seen != network.spec.observations:
         raise PolicyError(f"{path} sees more than the present observation, and the page computes that alone")
-    name = str(read_description(path).get("training", {}).get("learner", path.stem))
+    name = str(PolicyFile(path).read().get("training", {}).get("learner", path.stem))
     return {
         "label": labels.label(name),
         "color": labels.color(name),

@@ -19,7 +19,7 @@ from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.names import shortened
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.runner import floor
-from ballbot_train.policy.files import shipped_policies, shipped_ways, weights_digest
+from ballbot_train.policy.files import PolicyFile, shipped_policies, shipped_ways
 from ballbot_train.report import labels
 
 LEAST_SLIP = 0.02
@@ -108,7 +108,9 @@ def certified_replay(
         raise ValueError(f"episode must be 0 to {certified.EPISODES - 1}, not {episode}")
     episode_set = optima.known(problem, robot, [episode])
     takes, shipped = [], shipped_policies(problem, robot, None)
-    ways = {f"{task}/{name}": shipped_ways().get(weights_digest(path), "") for name, path in shipped.items()}
+    ways = {
+        f"{task}/{name}": shipped_ways().get(PolicyFile(path).weights_digest(), "") for name, path in shipped.items()
+    }
     named = labels.labels(controllers, task, ways)
     for name, friction in itertools.product(controllers, frictions or (None,)):
         controller, slips = make_controller(name, problem, params), list[float]()

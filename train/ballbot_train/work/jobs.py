@@ -29,7 +29,7 @@ Entry = dict[str, Any]
 """What is kept of one finished item: anything that JSON holds, NaN included."""
 
 MARKER = "unfinished.json"
-"""The file that says which configuration a folder belongs to."""
+"""The file that says which configuration a folder belongs to, while its run is unfinished."""
 
 _FOLDER = "unfinished"
 _LOCK = ".lock"
@@ -77,48 +77,85 @@ def make_folder(out: Path) -> None:
         raise ValueError(f"{out} cannot be a folder, because a file is in its place; give another --out") from error
 
 
-def unfinished(out: Path) -> Path:
-    """The folder within a run's folder that only serves to continue the run; `release` deletes it."""
-    return out / _FOLDER
+class RunFolder:
+    """The folder of a run, which belongs to one configuration and to one process at a time."""
+
+    def __init__(self, out: Path, marker: str = MARKER):
+        """Args: out: the folder; made when it is claimed. marker: name of the file in it that keeps the configuration."""
+        self.out, self._marker = out, marker
+
+    @property
+    def unfinished(self) -> Path:
+        """The folder within that only serves to continue the run; `release` deletes it."""
+        return self.out / _FOLDER
+
+    def claim(self, config: Mapping[str, Any], facts: Mapping[str, Any] | None = None) -> None:
+        """Marks the folder as belonging to one configuration, and locks it for this process until `release` or `unlock`.
+
+        The same configuration may claim the folder again, and so continues in it. Another one may where no job of an
+        unfinished run has come to its end.
+
+        Args:
+            config: what decides the results; anything that JSON holds.
+            facts: written along with the configuration, and not compared.
+
+        Raises:
+            ValueError: the folder belongs to another configuration, another process is using it, or its marker is damaged.
+        """
+        facts = {} if facts is None else facts
+        path, wanted, is_usual = self.out / self._marker, json.loads(json.dumps(dict(config))), self._marker == MARKER
+        locked_before = self._is_held
+        self._lock()
+        try:
+            if path.exists() and (not is_usual or any(self.unfinished.glob("*.json"))):
+                try:
+                    held = files.read_json(path)
+                except files.FileError as error:
+                    raise ValueError(f"{path} is damaged ({error}); delete it or give another --out") from error
+                held = {key: value for key, value in held.items() if key not in facts}
+                check_same(held, wanted, self.out, "an unfinished run" if is_usual else "a run")
+            files.write(path, json.dumps({**wanted, **facts}, indent=1) + "\n")
+        except BaseException:
+            if not locked_before:
+                self.unlock()
+            raise
+
+    def release(self) -> None:
+        """Ends a run whose results are written: deletes what only served to continue it, and unlocks the folder."""
+        shutil.rmtree(self.unfinished, ignore_errors=True)
+        (self.out / self._marker).unlink(missing_ok=True)
+        self.unlock()
+
+    def unlock(self) -> None:
+        """Lets other processes use the folder; its configuration stays. Without effect where this process holds no lock."""
+        lock = _held.pop(self.out.resolve(), None)
+        if lock is not None:
+            Path(lock.lock_file).unlink(missing_ok=True)  # while it is held, so that no other run's lock is deleted
+            lock.release()
+
+    @property
+    def _is_held(self) -> bool:
+        return self.out.resolve() in _held and (self.out / _LOCK).exists()
+
+    def _lock(self) -> None:
+        if self._is_held:
+            return
+        self.unlock()  # the folder was deleted meanwhile, and the lock with it
+        make_folder(self.out)
+        while not self._is_held:  # a lock that another process deleted between our opening and locking it is no lock
+            lock = filelock.FileLock(self.out.resolve() / _LOCK, timeout=0, thread_local=False)
+            try:
+                lock.acquire()
+            except filelock.Timeout:
+                raise ValueError(
+                    f"another run is using {self.out} right now; wait until it has ended, or give another --out"
+                ) from None
+            _held[self.out.resolve()] = lock
 
 
 def _path_of(out: Path, name: str) -> Path:
     plain = re.sub(r"[^\w-]", "-", name, flags=re.ASCII)[-100:]
-    return unfinished(out) / f"{plain if plain == name else f'{plain}-{zlib.crc32(name.encode()):08x}'}.json"
-
-
-def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:
-    """Marks a folder as belonging to one configuration, and locks it for this process until `release` or `unlock`.
-
-    The same configuration may claim the folder again, and so continues in it. Another one may where no job of an unfinished
-    run has come to its end.
-
-    Args:
-        out: the folder; made if missing.
-        config: what decides the results; anything that JSON holds.
-        marker: name of the file in the folder that keeps the configuration.
-        facts: written along with the configuration, and not compared.
-
-    Raises:
-        ValueError: the folder belongs to another configuration, another process is using it, or its marker is damaged.
-    """
-    facts = {} if facts is None else facts
-    path, wanted = out / marker, json.loads(json.dumps(dict(config)))
-    locked_before = _holds(out)
-    _lock(out)
-    try:
-        if path.exists() and (marker != MARKER or any(unfinished(out).glob("*.json"))):
-            try:
-                held = files.read_json(path)
-            except files.FileError as error:
-                raise ValueError(f"{path} is damaged ({error}); delete it or give another --out") from error
-            held = {key: value for key, value in held.items() if key not in facts}
-            check_same(held, wanted, out, "an unfinished run" if marker == MARKER else "a run")
-        files.write(path, json.dumps({**wanted, **facts}, indent=1) + "\n")
-    except BaseException:
-        if not locked_before:
-            unlock(out)
-        raise
+    return RunFolder(out).unfinished / f"{plain if plain == name else f'{plain}-{zlib.crc32(name.encode()):08x}'}.json"
 
 
 def check_same(held: Mapping[str, Any], wanted: Mapping[str, Any], out: Path, what: str) -> None:
@@ -167,41 +204,6 @@ def _changed_problem(key: str, old: Any, new: Any) -> str:
     listed = f"{', '.join(most)} and {last}" if most else last
     named = "" if key == "problem" else f" {key}"
     return f"another problem{named}: its {listed} {'have' if last.endswith('s') or most else 'has'} changed since"
-
-
-def release(out: Path, marker: str = MARKER) -> None:
-    """Ends a run whose results are written: deletes what only served to continue it, and unlocks the folder."""
-    shutil.rmtree(unfinished(out), ignore_errors=True)
-    (out / marker).unlink(missing_ok=True)
-    unlock(out)
-
-
-def unlock(out: Path) -> None:
-    """Lets other processes use a folder; its configuration stays. Without effect where this process holds no lock."""
-    lock = _held.pop(out.resolve(), None)
-    if lock is not None:
-        Path(lock.lock_file).unlink(missing_ok=True)  # while it is held, so that no other run's lock is deleted
-        lock.release()
-
-
-def _holds(out: Path) -> bool:
-    return out.resolve() in _held and (out / _LOCK).exists()
-
-
-def _lock(out: Path) -> None:
-    if _holds(out):
-        return
-    unlock(out)  # the folder was deleted meanwhile, and the lock with it
-    make_folder(out)
-    while not _holds(out):  # a lock that another process deleted between our opening and locking it is no lock
-        lock = filelock.FileLock(out.resolve() / _LOCK, timeout=0, thread_local=False)
-        try:
-            lock.acquire()
-        except filelock.Timeout:
-            raise ValueError(
-                f"another run is using {out} right now; wait until it has ended, or give another --out"
-            ) from None
-        _held[out.resolve()] = lock
 
 
 def run(

@@ -194,19 +194,19 @@ def make(
     """
     shards = Shards(url)
     about = {**about, "per_shard": per_shard}
-    jobs.claim(out, {"shards": url, **about}, "set.json")
+    run = jobs.RunFolder(out, "set.json")
+    run.claim({"shards": url, **about})
     if shards.about is None:
         shards.about = about
         shards.write_manifest()
     else:
         jobs.check_same(shards.about, about, Path(url), "a set")
-    folder = jobs.unfinished(out)
 
     def parts_of(shard: int) -> dict[range, Path]:
         """The parts of a shard, and the files in which those are kept that are there."""
         last = min((shard + 1) * per_shard, episodes)
         parts = (range(start, min(start + _CHUNK, last)) for start in range(shard * per_shard, last, _CHUNK))
-        return {part: folder / f"{part.start:09d}-{part.stop:09d}.npz" for part in parts}
+        return {part: run.unfinished / f"{part.start:09d}-{part.stop:09d}.npz" for part in parts}
 
     def missing() -> Iterator[Any]:
         for shard in range(-(-episodes // per_shard)):
@@ -235,5 +235,5 @@ def make(
             files.write(parts_of(part.start // per_shard)[part], files.npz(arrays, compressed=False))
             advance(named, len(part))
             join(part.start // per_shard)
-    jobs.release(out, "set.json")
+    run.release()
     return shards
