@@ -94,7 +94,7 @@ def test_a_saved_model_is_evaluated_by_its_path(tmp_path):
     assert len(evaluate_fresh(path, "stabilize", 3)) == 3
     with pytest.raises(ValueError, match="was made for a task with 8 observations, which is none of turn"):
         controllers_of(["turn"], [str(path)])
-    with pytest.raises(PolicyError, match="takes 8 observations, BallbotTurn-v0 has 9"):
+    with pytest.raises(PolicyError, match="takes 8 observations and gives 2 actions; BallbotTurn-v0 has 9 and 2"):
         load_actor(path, make_task("turn"), default_params())
 
 
@@ -203,7 +203,7 @@ def with_weights(**changes):
         (with_weights(weight=lambda weight: weight.int()), "action_net.weight holds torch.int32"),
         (with_weights(weight=lambda weight: weight + 3e38), "holds numbers beyond ±1e"),
         (with_weights(weight=lambda weight: torch.ones(1).expand(2, 2**28)), "numbers, and stores fewer"),
-        (with_weights(bias=lambda bias: torch.zeros(3)), "is no network of linear layers that ends in 2 actions"),
+        (with_weights(bias=lambda bias: torch.zeros(3)), "is no network of linear layers that ends in actions"),
         (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}, which is not read"),
         (lambda members: members.pop("data"), "it holds no data"),
         (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
