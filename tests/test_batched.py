@@ -183,7 +183,7 @@ def test_short_episodes_do_not_count_what_comes_after(params, duration):
 
 
 def test_without_a_compiler_they_are_found_one_by_one(monkeypatch, params, interpreted):
-    task, x0 = Stabilize(max_tilt=1.3, duration=2.0), np.array([[0.1] + [0.0] * 7, FALLEN])
+    task, x0 = Stabilize(max_tilt=1.3, duration=1.0), np.array([[0.1] + [0.0] * 7, FALLEN])
 
     def missing(*arguments):
         raise machine_code.NoMachineCodeError
@@ -239,6 +239,5 @@ def test_diverging_iterations_warn_of_nothing(params):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         find_optima(Stabilize(), params, x0, np.zeros((3, 0)))
-        for x in x0:
-            with contextlib.suppress(PlanError):
-                find_optimum(Stabilize(), params, x, NO_CONSTANTS, twice=True)
+        with contextlib.suppress(PlanError):
+            find_optimum(Stabilize(), params, x0[0], NO_CONSTANTS, twice=True)
