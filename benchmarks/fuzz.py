@@ -208,7 +208,7 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type
 
     task, config = make_task("turn"), {"learner": "apg", "task": "turn"}
     settings = apg.ApgConfig(iterations=2, evaluations=1, num_envs=2, episode_seconds=0.04, hidden=(4,))
-    made = apg.Apg(task, default_params(), settings)
+    made = apg.make(task, default_params(), settings)
     run = training._Run(made, task, config | {"settings": asdict(settings)}, folder / "run", False)
     run.score()
     run.save()
@@ -216,7 +216,7 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type
     def resume() -> None:
         jobs.RunFolder(folder / "run").unlock()
         training._Run(
-            apg.Apg(task, default_params(), settings),
+            apg.make(task, default_params(), settings),
             task,
             config | {"settings": asdict(settings)},
             folder / "run",

@@ -105,7 +105,7 @@ def claim_of_benchmark(out: Path) -> None:
 
 def claim_of_training(out: Path) -> None:
     task = TASKS["stabilize"]()
-    training.train(apg.Apg(task, named_robot("paper"), TINY), task, {"learner": "apg", "task": "stabilize"}, out, True)
+    training.train(apg.make(task, named_robot("paper"), TINY), task, {"learner": "apg", "task": "stabilize"}, out, True)
 
 
 def claim_of_demos(out: Path) -> None:
@@ -219,7 +219,7 @@ def test_training_a_robot_without_a_name_is_refused(tmp_path: Path, monkeypatch:
         with pytest.raises(ValueError, match=r"this robot has no name.*register_robot"):
             learner.make(task, light, learner.settings("stabilize"), 0)
     monkeypatch.setitem(ROBOTS, "light", Registered(light, {}))
-    made = apg.Apg(task, light, TINY)
+    made = apg.make(task, light, TINY)
     with pytest.raises(ValueError, match="""the learner trains 'light', and "robot" of config is 'paper'"""):
         training.train(made, task, {"learner": "apg", "task": "stabilize"}, tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -261,7 +261,7 @@ def test_last_values_of_many_episodes_at_once_are_those_that_sb3_would_add_one_b
     config = replace(ppo.TUNED["stabilize"], num_envs=32, num_steps=24, batch_size=128, hidden=(16,))
     rewards = []
     for together in (True, False):
-        learner = ppo.Ppo(make_task("stabilize"), default_params(), config, seed=3)
+        learner = ppo.make(make_task("stabilize"), default_params(), config, seed=3)
         if not together:
             learner._env.bootstrap = None
         learner.iterate()

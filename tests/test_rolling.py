@@ -15,7 +15,7 @@ from ballbot_baselines.optimum import certification
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import certified
-from ballbot_gym.engines.bullet import BulletContactSimulator
+from ballbot_gym.engines import make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import (
@@ -169,7 +169,7 @@ def test_bullets_contact_converges_to_the_closed_form_with_first_order(rolling):
     forces, states = balancing(grippy)
     errors = []
     for physics_dt in (2e-3, 1e-3, 5e-4):
-        simulator = BulletContactSimulator(grippy, 0.02, physics_dt)
+        simulator = make_simulator("bullet", grippy, 0.02, physics_dt)
         simulator.reset(START)
         found = [np.array(simulator.step(u)) for u in forces]
         errors.append(np.abs(np.array(found) - states).max())
@@ -186,7 +186,7 @@ def test_bullets_ball_slips_where_the_closed_form_leaves_the_cone(rolling):
     """From standing still, the force at which the ball slips within a control step is that of the cone within 2 %."""
 
     def slip(force):
-        simulator = BulletContactSimulator(rolling, 0.02)
+        simulator = make_simulator("bullet", rolling, 0.02)
         simulator.reset((0.0,) * 8)
         simulator.step((force, 0.0))
         found = np.hypot(*simulator.slip())

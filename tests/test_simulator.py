@@ -9,7 +9,6 @@ import pybullet
 import pytest
 
 from ballbot_gym.engines import bullet, make_simulator
-from ballbot_gym.engines.bullet import BulletSimulator
 from ballbot_gym.robot import ROBOTS, named_robot, urdf_text
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
@@ -93,7 +92,7 @@ def test_inertias_that_no_body_can_have_are_refused(params):
 def test_bullet_refuses_a_robot_whose_numbers_it_does_not_hold(params, monkeypatch):
     monkeypatch.setattr(bullet, "urdf_text", lambda robot: urdf_text(robot).replace('"15.0"', '"fifteen"'))
     with pytest.raises(RuntimeError, match=r"PyBullet took \(0.0"):
-        BulletSimulator(params, 0.02)
+        make_simulator("bullet", params, 0.02)
 
 
 @pytest.mark.parametrize("change", [{"gravity": 3.7}, {"body_mass": 9.0}, {"com_height": 0.4, "gravity": 3.7}], ids=str)
@@ -139,7 +138,7 @@ def test_two_simulators_do_not_disturb_each_other(params, physics):
 
 def test_forgotten_simulators_release_their_clients(params):
     before = open_clients()
-    simulator = BulletSimulator(params, 0.02)
+    simulator = make_simulator("bullet", params, 0.02)
     assert open_clients() == before + 1
     del simulator
     assert open_clients() == before
@@ -148,4 +147,4 @@ def test_forgotten_simulators_release_their_clients(params):
 def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda mode: -1)
     with pytest.raises(RuntimeError, match=r"no free physics client; close\(\)"):
-        BulletSimulator(params, 0.02)
+        make_simulator("bullet", params, 0.02)

@@ -50,7 +50,7 @@ SETTINGS += ["--test-episodes", 3]
 def test_apg_goes_on_from_its_state_as_if_never_stopped(name):
     tiny = {"iterations": 4, "num_envs": 4, "episode_seconds": 0.06, "hidden": (8,)}
     config = replace(LEARNERS["apg"].settings(name), **tiny)
-    assert goes_on_as_if_never_stopped(lambda seed: apg.Apg(TASKS[name](), default_params(), config, seed))
+    assert goes_on_as_if_never_stopped(lambda seed: apg.make(TASKS[name](), default_params(), config, seed))
 
 
 def test_apg_starts_at_lqr_and_lowers_the_cost():
@@ -59,7 +59,7 @@ def test_apg_starts_at_lqr_and_lowers_the_cost():
     config = replace(
         LEARNERS["apg"].settings("stabilize"), iterations=10, num_envs=32, episode_seconds=2.0, hidden=(32,)
     )
-    learner = apg.Apg(task, params, config)
+    learner = apg.make(task, params, config)
     before = training.score_and_validate(learner.network, task, episodes=1)
     assert before["certified/success"] > 0.5  # LQR within the limits of tanh
     for _ in range(config.iterations):
@@ -71,13 +71,13 @@ def test_apg_starts_at_lqr_and_lowers_the_cost():
 def test_apg_starts_from_a_policy_of_any_shape_and_robot():
     task, params = TASKS["turn"](), default_params()
     config = apg.ApgConfig(iterations=2, num_envs=4, episode_seconds=0.04, hidden=(8,))
-    donor = apg.Apg(task, params, config, 1)
-    learner = apg.Apg(task, params, replace(config, hidden=(9,)), 2, donor.network)
+    donor = apg.make(task, params, config, 1)
+    learner = apg.make(task, params, replace(config, hidden=(9,)), 2, donor.network)
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
     donor.network.spec = replace(donor.network.spec, robot="rolling", task=replace(task, max_speed=3.0).problem())
-    assert apg.Apg(task, params, config, 2, donor.network).network.spec.robot == "paper"
+    assert apg.make(task, params, config, 2, donor.network).network.spec.robot == "paper"
 
 
 def test_a_setting_of_apg_that_would_do_nothing_says_so():
@@ -91,7 +91,7 @@ class Killed(BaseException):
 
 def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    iterate = apg.Apg.iterate
+    iterate = apg.make.iterate
 
     def killed_after_four(self):
         if self.iteration == 4:
@@ -102,7 +102,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed, monkeypatch):
     assert typed("train", *common, "--out", whole)[0] == 0
     with monkeypatch.context() as patch:
         patch.setattr(training, "_CHECKPOINT_SECONDS", 0.0)
-        patch.setattr(apg.Apg, "iterate", killed_after_four)
+        patch.setattr(apg.make, "iterate", killed_after_four)
         with pytest.raises(Killed):
             typed("train", *common, "--out", killed)
     ended, printed = typed("train", *common, "--out", killed)
@@ -122,7 +122,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed, monkeypatch):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder(tmp_path, typed, monkeypatch, number):
-    iterate = apg.Apg.iterate
+    iterate = apg.make.iterate
 
     def interrupted(self):
         if self.iteration == 3:
@@ -130,7 +130,7 @@ def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder
         return iterate(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(apg.Apg, "iterate", interrupted)
+        patch.setattr(apg.make, "iterate", interrupted)
         ended, printed = typed("train", "apg", *SETTINGS, "--out", "a run")
     assert (ended, "this continues where it stopped" in printed) == (130, True), printed
     shutil.copytree(tmp_path / "a run", tmp_path / "copy")
@@ -158,7 +158,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     for content in (b"", b"garbage", b"PK\x03\x04"):
         (tmp_path / "checkpoint.pt").write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
-            training.train(apg.Apg(task, params, config), task, about, tmp_path, resume=True)
+            training.train(apg.make(task, params, config), task, about, tmp_path, resume=True)
 
 
 @pytest.fixture
@@ -169,7 +169,7 @@ def short_run(tmp_path, monkeypatch):
     monkeypatch.setattr(training._Run, "measure", lambda run, count: None)
 
     def start(resume=False):
-        learner = apg.Apg(task, params, config)
+        learner = apg.make(task, params, config)
         training.train(learner, task, {"learner": "apg", "task": "stabilize"}, tmp_path, resume)
         return learner
 

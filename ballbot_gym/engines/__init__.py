@@ -5,13 +5,12 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
-from ballbot_gym.engines.bullet import BulletContactSimulator, BulletOmniSimulator, BulletSimulator
+from ballbot_gym.engines import bullet, mujoco
 from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoOmniSimulator, MujocoSimulator, import_mujoco
 from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.lazy import install
-from ballbot_gym.robot import Omni, PointBall, Robot, RollingBall
+from ballbot_gym.robot import Robot
 
 __all__ = [
     "PHYSICS",
@@ -27,8 +26,8 @@ __all__ = [
 ]
 
 PHYSICS: dict[str, dict[type[Robot], Callable[..., Simulator]]] = {
-    "bullet": {PointBall: BulletSimulator, RollingBall: BulletContactSimulator, Omni: BulletOmniSimulator},
-    "mujoco": {PointBall: MujocoSimulator, RollingBall: MujocoContactSimulator, Omni: MujocoOmniSimulator},
+    "bullet": bullet.SIMULATORS,
+    "mujoco": mujoco.SIMULATORS,
     "rk4": {Robot: Rk4Simulator},
 }
 """Simulators by the name that `gymnasium.make(..., physics=name)` takes, and by the kind of robot that they simulate.
@@ -72,7 +71,7 @@ def check_installed(physics: str) -> None:
     if physics == "bullet":
         import_pybullet()
     elif physics == "mujoco":
-        import_mujoco()
+        mujoco.import_mujoco()
 
 
 def default_physics(params: Robot | None = None) -> str:
@@ -93,7 +92,13 @@ def default_physics(params: Robot | None = None) -> str:
 
 
 def make_simulator(physics: str, params: Robot, control_dt: float, physics_dt: float | None = None) -> Simulator:
-    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`.
+    """The simulator of a robot, with contact where its ball rolls, except in "rk4".
+
+    Args:
+        physics: a name in `PHYSICS`.
+        params: the robot.
+        control_dt: s, how long each force is held.
+        physics_dt: s, the engine's step, a whole fraction of control_dt; default, one that suits the engine.
 
     Raises:
         ValueError: this physics does not simulate this kind of robot.

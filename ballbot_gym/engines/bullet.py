@@ -10,7 +10,7 @@ from typing import Any
 
 from ballbot_gym.engines.bullet_client import import_pybullet
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State
-from ballbot_gym.robot import omni, urdf_text
+from ballbot_gym.robot import Omni, PointBall, RollingBall, omni, urdf_text
 
 _JOINTS = ("x", "y", "gamma", "theta", "psi")  # the last where wheels turn the body
 _loading = threading.Lock()
@@ -19,7 +19,7 @@ _0 = (0.0, 0.0)
 _PRESSED = -1e-5  # m: height of the ball at reset, about where its weight presses it
 
 
-class BulletSimulator(Simulator):
+class _BulletSimulator(Simulator):
     """The URDF of a robot whose ball translates in PyBullet, in a physics client that this object owns."""
 
     def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
@@ -136,14 +136,14 @@ class BulletSimulator(Simulator):
                 raise RuntimeError(f"PyBullet took {found} for {numbers}, kg, kg·m² and m; it cannot simulate {robot}")
 
 
-class BulletContactSimulator(BulletSimulator):
+class _BulletContactSimulator(_BulletSimulator):
     """The URDF of a robot whose ball rolls in PyBullet, on a floor: the ball may slip, and leave the floor.
 
     The force u represents the torque r e_z × u from the body on the ball, which is held over the control step.
     """
 
     def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
-        """Args: as for `BulletSimulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
+        """Args: as for `make_simulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
         super().__init__(params, control_dt, physics_dt)
         bullet, client = self._bullet, self._client
         self._substeps = self._whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
@@ -224,7 +224,7 @@ class BulletContactSimulator(BulletSimulator):
             raise RuntimeError(f"PyBullet took {found} for a friction of {friction}")
 
 
-class BulletOmniSimulator(BulletContactSimulator):
+class _BulletOmniSimulator(_BulletContactSimulator):
     """A robot with three omni-wheels in PyBullet, on a floor: the ball may slip, and leave the floor.
 
     The motors' torque falls with the wheels' speed over the real ball. The rotors' is that of the acceleration that the robot
@@ -232,7 +232,7 @@ class BulletOmniSimulator(BulletContactSimulator):
     """
 
     def __init__(self, params: Any, control_dt: float, physics_dt: float | None = None):
-        """Args: as for `BulletSimulator`."""
+        """Args: as for `make_simulator`."""
         super().__init__(params, control_dt, physics_dt)
         self._steps, self._substeps = self._substeps, 1
         self._bullet.setPhysicsEngineParameter(
@@ -265,3 +265,7 @@ class BulletOmniSimulator(BulletContactSimulator):
         a, b, c, d, e = bullet.getJointStates(self._robot, self._joints, client)
         turning = bullet.getLinkState(self._robot, self._ball, computeLinkVelocity=1, physicsClientId=client)[7]
         return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1], e[0], e[1], turning[2]), turning
+
+
+SIMULATORS = {PointBall: _BulletSimulator, RollingBall: _BulletContactSimulator, Omni: _BulletOmniSimulator}
+"""By the kind of robot that they simulate."""

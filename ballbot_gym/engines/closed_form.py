@@ -9,7 +9,7 @@ class Rk4Simulator(Simulator):
     """The closed-form model, integrated by RK4 steps of at most `RK4_STEP`."""
 
     def __init__(self, params: Robot, control_dt: float, physics_dt: float | None = None):
-        """Args: as for `BulletSimulator`; physics_dt defaults to `RK4_STEP`."""
+        """Args: as for `make_simulator`; physics_dt defaults to `RK4_STEP`."""
         self._params = params
         self._dt = control_dt
         self._substeps = (

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import omni
+from ballbot_gym.robot import Omni, PointBall, RollingBall, omni
 
 _PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
 _ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo requires a mass of every moving body
@@ -17,7 +17,7 @@ _BODY, _BALL = 2, 3  # after the world and the hub, in the order in which they a
 _LEANS = (((0, 1, 0), "gamma"), ((-1, 0, 0), "theta"))
 
 
-class MujocoSimulator(Simulator):
+class _MujocoSimulator(Simulator):
     """A robot whose ball translates in MuJoCo, integrated by RK4."""
 
     _places = (0, 1, 2, 3)  # of x, y, γ and θ among the joints
@@ -114,7 +114,7 @@ class MujocoSimulator(Simulator):
         return int(self._mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class MujocoContactSimulator(MujocoSimulator):
+class _MujocoContactSimulator(_MujocoSimulator):
     """A robot whose ball rolls in MuJoCo, on a floor: the ball may slip, and leave the floor.
 
     The force u represents the torque r e_z × u from the body on the ball, which is held over the control step.
@@ -201,7 +201,7 @@ class MujocoContactSimulator(MujocoSimulator):
         softness[0], softness[1] = max(2 * self._dt, 2 * math.hypot(*self.slip()) / strength), 1
 
 
-class MujocoOmniSimulator(MujocoContactSimulator):
+class _MujocoOmniSimulator(_MujocoContactSimulator):
     """A robot with three omni-wheels in MuJoCo, on a floor: the ball may slip, and leave the floor.
 
     A wheel is an actuator between body and ball, whose force falls with its speed, and so is the floor's torque against the
@@ -283,6 +283,10 @@ class MujocoOmniSimulator(MujocoContactSimulator):
                 biasprm=(0, 0, -damping, *[0] * 7),
                 gainprm=(1, *[0] * 9),
             )
+
+
+SIMULATORS = {PointBall: _MujocoSimulator, RollingBall: _MujocoContactSimulator, Omni: _MujocoOmniSimulator}
+"""By the kind of robot that they simulate."""
 
 
 def import_mujoco() -> ModuleType:

@@ -3,13 +3,15 @@
 import math
 from pathlib import Path
 
+import numpy as np
+
 from ballbot_gym.engines import default_physics
 from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter
 from ballbot_train.evaluation.controllers import behind
 from ballbot_train.evaluation.names import file_part
-from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
+from ballbot_train.report.film import Format, film_frames, write_film, write_strip
 from ballbot_train.report.replay import certified_replay, file_replay
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 
@@ -79,9 +81,9 @@ def replay(
     if format == "png":
         console.print(f"picture: {write_strip(shown, path, frames, end)}")
         return
-    count = end / speed * fps
+    count = end * fps / speed
     _check(count <= _MOST_FRAMES, f"the film would have {count:.3g} frames; give another speed or fps")
-    times = film_times(end, fps, speed)
+    times = np.minimum(np.arange(math.ceil(count) + 1) * speed / fps, end)
     with progress_bar() as progress:
         drawn = film_frames(shown, times, width or _WIDTHS[format])
         write_film(progress.track(drawn, total=len(times), description="frames"), path, fps)

@@ -128,20 +128,9 @@ def evaluate(
         with progress_bars({"episodes": len(indices)}, late=True) as advance:
             results = run_episodes(env, controller, *named, indices, 0, known, motions, partial(advance, "episodes"))
         (row,) = leaderboard(results)
-        if out is not None and held is not None:
-            ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": env.params.record()}
+        if held is not None:
             digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
-            key, problem = f"{on}/{named[0]}", {on: problem_parts(env.task, env.params)}
-            more = {
-                "problems": problem,
-                "policies": {key: digest} if digest else {},
-                "files": {key: file} if file else {},
-            }
-            results, facts = held.joined(Path(out), ran, more, results)
-            write_results(leaderboard(results), results, provenance() | facts, Path(out))
-            if not env.randomization.active:
-                who = env.physics, named[0], digest
-                recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)
+            held.add(env, file, digest, results, motions)
         return row
     finally:
         env.close()
@@ -169,24 +158,53 @@ def _on_fresh(
 class _Held:
     """What a folder of results holds before a row is added: its facts, and its episodes."""
 
+    out: Path
     about: Mapping[str, Any]
     results: Sequence[Result]
 
     @classmethod
     def of(cls, out: Path) -> "_Held":
-        return cls(*(read_results(out) if (out / "leaderboard.json").exists() else ({}, [])))
+        return cls(out, *(read_results(out) if (out / "leaderboard.json").exists() else ({}, [])))
 
     def file(self, task: str, name: str) -> str | None:
         """The policy file of a row; None if there is no such row, or its file was not recorded."""
         return self.about.get("files", {}).get(f"{task}/{name}")
 
-    def joined(
-        self, out: Path, ran: dict[str, Any], more: dict[str, dict[str, Any]], new: Sequence[Result]
+    def add(
+        self,
+        env: BallbotEnv,
+        file: str,
+        digest: str,
+        new: Sequence[Result],
+        motions: Sequence[recordings.Recording],
+    ) -> None:
+        """Writes the folder with the episodes of a new row, and what was done in them. Errors: see `_joined`.
+
+        Args:
+            env: in which the row was run.
+            file: of its policy, or "".
+            digest: of the weights of its policy, or "".
+            new: the episodes of the row.
+            motions: what was done in them.
+        """
+        task, name = new[0].task, new[0].controller
+        ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": env.params.record()}
+        more = {
+            "problems": {task: problem_parts(env.task, env.params)},
+            "policies": {f"{task}/{name}": digest} if digest else {},
+            "files": {f"{task}/{name}": file} if file else {},
+        }
+        results, facts = self._joined(ran, more, new)
+        write_results(leaderboard(results), results, provenance() | facts, self.out)
+        if not env.randomization.active:
+            recordings.write_in(self.out, motions, env.task, task, env.params, env.physics, name, digest)
+
+    def _joined(
+        self, ran: dict[str, Any], more: dict[str, dict[str, Any]], new: Sequence[Result]
     ) -> tuple[list[Result], dict[str, Any]]:
         """The results with those of a new row, and the facts of all of them. A row of the same policy is replaced.
 
         Args:
-            out: the folder.
             ran: facts that are the same for all rows.
             more: facts by task, or by task and name, of the new row.
             new: the episodes of the new row.
@@ -195,7 +213,7 @@ class _Held:
             ValueError: the folder is of another engine, robot or randomization; of another problem of this name; or a row
                 of another policy has this name.
         """
-        task, name = new[0].task, new[0].controller
+        out, task, name = self.out, new[0].task, new[0].controller
         if self.results:
             from ballbot_train.work import jobs  # it needs the library of locks
 

@@ -32,7 +32,7 @@ from ballbot_train.policy.network import PolicyNetwork
 
 @dataclass(frozen=True)
 class ApgConfig(Settings):
-    """Settings of `Apg`."""
+    """Settings of the learner."""
 
     iterations: int = number(300, 1, MOST)
     """Iterations of `num_envs` whole episodes."""
@@ -83,7 +83,7 @@ _PATIENCE = 5  # control steps for which episodes go on when all have reached th
 _STATE = ("iteration", "_trained", "_average", "_optimizer", "_batch")
 
 
-class Apg:
+class _Apg:
     """The learner; see `training.Learner`."""
 
     def __init__(
@@ -221,4 +221,4 @@ class Apg:
         return result.final_x, cost, lacking, (goal <= 0).all(0), failed, new.actuator, new.past
 
 
-make = Apg
+make = _Apg

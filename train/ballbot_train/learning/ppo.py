@@ -30,7 +30,7 @@ from ballbot_train.policy.network import PolicyNetwork
 
 @dataclass(frozen=True)
 class PpoConfig(ModelFreeConfig):
-    """Settings of `Ppo`."""
+    """Settings of the learner."""
 
     gae_lambda: float = number(0.98, 0, 1)
     """λ of the advantages."""
@@ -202,7 +202,7 @@ def _keep_critic_rate(optimizer: torch.optim.Optimizer, *_: object) -> None:
     optimizer.param_groups[1]["lr"] = _WARM_CRITIC_RATE  # SB3 gives one to all groups
 
 
-class Ppo(ModelFree):
+class _Ppo(ModelFree):
     """The learner; see `training.Learner`."""
 
     def __init__(
@@ -276,4 +276,4 @@ class Ppo(ModelFree):
         return super()._improve()
 
 
-make = Ppo
+make = _Ppo

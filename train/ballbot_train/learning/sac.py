@@ -35,7 +35,7 @@ from ballbot_train.policy.network import PolicyNetwork
 
 @dataclass(frozen=True)
 class SacConfig(ModelFreeConfig):
-    """Settings of `Sac`."""
+    """Settings of the learner."""
 
     symmetry: Literal["none", "mirrors", "frame", "fine_frame", "centred"] = "none"
     """What actor and critics keep of the task's symmetry."""
@@ -235,7 +235,7 @@ def _last_bias(critic: torch.nn.Module) -> torch.Tensor:
     return cast(torch.nn.Linear, last).bias
 
 
-class Sac(ModelFree):
+class _Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
     def __init__(
@@ -337,4 +337,4 @@ class Sac(ModelFree):
         return max(living, self._value_of_living(1.0)) if self._trained.first_exit else living
 
 
-make = Sac
+make = _Sac

@@ -66,11 +66,6 @@ def write_film(frames: Iterable[np.ndarray], path: Path, fps: int = 25) -> Path:
     return files.write(path, content)
 
 
-def film_times(seconds: float, fps: int, speed: float) -> np.ndarray:
-    """The times of the episode at which a film's frames are drawn, s."""
-    return np.minimum(np.arange(math.ceil(seconds * fps / speed) + 1) * speed / fps, seconds)
-
-
 def film_frames(replay: Replay, times: Sequence[float] | np.ndarray, width: int = 1280) -> Iterator[np.ndarray]:
     """Yields frames (h, width, 3), uint8, at times of the episode, s: the takes side by side, at most four in a row."""
     width, height = width // 2 * 2, width * 9 // 32 * 2  # H.264 wants even sizes

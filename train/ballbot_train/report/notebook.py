@@ -5,7 +5,6 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -17,14 +16,14 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Moving
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import report_page
-from ballbot_train.report.replay import Replay, Take, playable
+from ballbot_train.report.replay import Replay, Take
 
 _HEIGHT = 520  # px of a replay below a cell
 
 
 def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | Robot) -> Path | None:
     """See `ballbot_gym.trajectory.Moving.show`."""
-    takes = tuple(replace(take, trajectory=playable(take.trajectory, take.label)) for take in _takes(shown, names))
+    takes = tuple(take.playable() for take in _takes(shown, names))
     title = " and ".join(take.label for take in takes)
     page = report_page(title, [Replay(title, takes, _markers(shown), checked_robot(robot))])
     if _in_notebook():

@@ -45,6 +45,19 @@ class Take:
     slip: np.ndarray | None = None
     """(n,) speed of the ball's lowest point over the floor as each force begins, m/s, where contact is simulated."""
 
+    def playable(self, name: str = "") -> "Take":
+        """The same from time 0 on, with states that a replay can join by straight lines.
+
+        Raises:
+            ValueError: it holds a single state; the message says the name, or else the label.
+        """
+        moved = self.trajectory
+        if not len(moved.u):
+            raise ValueError(f"{name or self.label} holds a single state: nothing moves")
+        if moved.xdot is not None or not moved.held:
+            moved = moved.resampled(_FILE_DT)
+        return replace(self, trajectory=replace(moved, t=moved.t - moved.t[0]))
+
     def slip_at(self, t: float) -> float:
         """The slip at time t, s; 0 after the end."""
         if self.slip is None or t >= self.trajectory.duration:
@@ -159,20 +172,6 @@ def file_replay(paths: Sequence[Path]) -> Replay:
     """
     takes, names = [], shortened(map(str, paths))
     for i, path in enumerate(paths):
-        trajectory = playable(Trajectory.load(path), str(path))
         label = names[str(path)].removesuffix(path.suffix)
-        takes.append(Take(label, trajectory, labels.color(path.stem, i)))
+        takes.append(Take(label, Trajectory.load(path), labels.color(path.stem, i)).playable(str(path)))
     return Replay(", ".join(take.label for take in takes), tuple(takes))
-
-
-def playable(trajectory: Trajectory, name: str) -> Trajectory:
-    """A trajectory from time 0 on, with states that a replay can join by straight lines.
-
-    Raises:
-        ValueError: it holds a single state; the message says its name.
-    """
-    if not len(trajectory.u):
-        raise ValueError(f"{name} holds a single state: nothing moves")
-    if trajectory.xdot is not None or not trajectory.held:
-        trajectory = trajectory.resampled(_FILE_DT)
-    return replace(trajectory, t=trajectory.t - trajectory.t[0])
