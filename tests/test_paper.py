@@ -181,7 +181,7 @@ def test_guess_along_an_accelerating_path_is_the_motion_itself(params):
 def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
     pytest.importorskip("pybullet")
     plan = plan_of("stabilize-1")
-    executed, error = problems.track_plan(plan, params)
+    executed, error = problems.PaperProblem.track(plan, params)
     assert error < 0.01  # measured: 1 mm
     assert executed.duration == pytest.approx(plan.trajectory.duration, abs=problems.TRACKING_DT)
 
@@ -189,7 +189,7 @@ def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
 def test_lqr_and_trajectory_optimization_start_where_the_papers_problem_starts():
     pytest.importorskip("pybullet")
     entry = PAPER_PROBLEMS["stabilize-1"]
-    episodes = problems.compare_stabilization(entry)
+    episodes = entry.compare()
     steps = {name: np.diff(episode.trajectory.t) for name, episode in episodes.items()}
     assert {name: round(1 / step.mean()) for name, step in steps.items()} == {"lqr": 1000, "trajopt": 50}
     for episode in episodes.values():

@@ -63,6 +63,37 @@ class PaperProblem:
         """
         return solve(self.problem, params, self.guess(params), solver)
 
+    def compare(self) -> dict[str, Episode]:
+        """Episodes of LQR and of trajectory optimization in PyBullet, both with Stabilize's weights, as in the paper's
+        Figs 2, 3, from the initial state of the problem.
+        """
+        runs = {
+            "lqr": (LqrController, BallbotEnv("stabilize", control_dt=LQR_DT, physics_dt=LQR_DT / 4)),
+            "trajopt": (TrajoptController, BallbotEnv("stabilize")),
+        }
+        episodes = {}
+        for name, (kind, env) in runs.items():
+            episodes[name] = rollout(env, kind(env.task, env.params), options={"state": self.problem.initial[0]})
+            env.close()
+        return episodes
+
+    @staticmethod
+    def track(plan: Optimum, params: Ballbot) -> tuple[Trajectory, float]:
+        """A plan's execution under TVLQR, in PyBullet where it is installed, with the weights of the paper's cost.
+
+        Returns:
+            What was executed, and the largest distance between its path and the plan's, m.
+        """
+        trajectory, dt = plan.trajectory, TRACKING_DT
+        task = Stabilize(
+            control_dt=dt, position_weight=DISTANCE_WEIGHT, rest_weight=REST_WEIGHT, effort_weight=EFFORT_WEIGHT
+        )
+        upright = np.zeros(8), np.zeros(2), np.zeros(0)  # uniform motion upright linearizes like standing
+        controller = TvlqrController.for_task(task, params, trajectory, end=discrete_lqr(task, params, *upright))
+        executed = simulate(controller, params, trajectory.x[0], round(trajectory.duration / dt) * dt, dt)
+        planned = np.array([trajectory.state(t) for t in executed.t])
+        return executed, float(np.hypot(*(executed.x - planned)[:, :2].T).max())
+
 
 def between_states(
     name: str,
@@ -216,36 +247,3 @@ PAPER_PROBLEMS: dict[str, PaperProblem] = {
     )
 }
 """The paper's experiments by name."""
-
-
-def track_plan(plan: Optimum, params: Ballbot) -> tuple[Trajectory, float]:
-    """A plan's execution under TVLQR, in PyBullet where it is installed, with the weights of the paper's cost.
-
-    Returns:
-        What was executed, and the largest distance between its path and the plan's, m.
-    """
-    trajectory, dt = plan.trajectory, TRACKING_DT
-    task = Stabilize(
-        control_dt=dt, position_weight=DISTANCE_WEIGHT, rest_weight=REST_WEIGHT, effort_weight=EFFORT_WEIGHT
-    )
-    upright = np.zeros(8), np.zeros(2), np.zeros(0)  # uniform motion upright linearizes like standing
-    controller = TvlqrController.for_task(task, params, trajectory, end=discrete_lqr(task, params, *upright))
-    executed = simulate(controller, params, trajectory.x[0], round(trajectory.duration / dt) * dt, dt)
-    planned = np.array([trajectory.state(t) for t in executed.t])
-    return executed, float(np.hypot(*(executed.x - planned)[:, :2].T).max())
-
-
-def compare_stabilization(entry: PaperProblem) -> dict[str, Episode]:
-    """Episodes of LQR and of trajectory optimization in PyBullet, both with Stabilize's weights, as in the paper's Figs 2, 3.
-
-    They start from the initial state of the paper's problem.
-    """
-    runs = {
-        "lqr": (LqrController, BallbotEnv("stabilize", control_dt=LQR_DT, physics_dt=LQR_DT / 4)),
-        "trajopt": (TrajoptController, BallbotEnv("stabilize")),
-    }
-    episodes = {}
-    for name, (kind, env) in runs.items():
-        episodes[name] = rollout(env, kind(env.task, env.params), options={"state": entry.problem.initial[0]})
-        env.close()
-    return episodes

@@ -11,8 +11,6 @@ from ballbot_baselines.paper.problems import (
     PAPER_PROBLEMS,
     TRACKING_DT,
     PaperProblem,
-    compare_stabilization,
-    track_plan,
 )
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.robot import default_params
@@ -36,7 +34,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
     for name in only or PAPER_PROBLEMS:
         entry = PAPER_PROBLEMS[name]
         plan = entry.solve(params)
-        executed, error = track_plan(plan, params)
+        executed, error = entry.track(plan, params)
         plan.trajectory.save(out / f"{name}.npz")
         takes = [
             figures.Take("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", style="--"),
@@ -71,7 +69,7 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
     for name in names:
         entry = PAPER_PROBLEMS[name]
         takes = []
-        for controller, episode in compare_stabilization(entry).items():
+        for controller, episode in entry.compare().items():
             rate = f"{len(episode.trajectory.u) / episode.trajectory.duration:.0f} Hz"
             label = f"{labels.label(controller)}, {rate}"
             takes.append(figures.Take(label, episode.trajectory, labels.color(controller)))

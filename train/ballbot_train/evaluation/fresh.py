@@ -9,7 +9,6 @@ which training chooses a policy is drawn for another purpose, and so shares no e
 """
 
 import itertools
-import json
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,8 +33,8 @@ from ballbot_train.evaluation.controllers import as_controller, is_expert, make_
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.policy.network import PolicyNetwork
-from ballbot_train.work.console import progress_bars
-from ballbot_train.work.executors import Workers, completed
+from ballbot_train.work import jobs
+from ballbot_train.work.executors import Workers
 
 with imports_of(__name__):
     import torch
@@ -169,26 +168,14 @@ class FreshResult:
 
     def with_optima(self, count: int, workers: int | Workers) -> "FreshResult":
         """The same with the optima of its first `count` episodes, NaN where none was found. They stay in the user's cache."""
-        task, params, costs = self.task, named_robot(self.robot), np.full(count, np.nan)
-        folder = cache.folder(task, params, self.randomization) / f"fresh-{self.seed}"
+        task, params, varied = self.task, named_robot(self.robot), self.randomization
         name = name_of(task) or task.id
-
-        def missing() -> Iterator[Any]:
-            for i in range(count):
-                path = folder / f"{i:06d}.json"
-                try:
-                    costs[i] = files.read_json(path, kind=float)
-                    advance(name, 1)
-                except files.FileError:
-                    x, c, drawn = self.states[i], self.constants[i], tuple(self.drawn[i].tolist())
-                    yield (i, path), _optimal_cost, (task, params, x, c, self.randomization, drawn)
-
-        with progress_bars({name: count}) as advance:
-            for (i, path), cost in completed(missing(), workers):
-                files.write(path, json.dumps(cost))
-                costs[i] = cost
-                advance(name, 1)
-        return replace(self, optima=costs)
+        work = [
+            jobs.Job(f"{i:06d}", _optimum, (task, params, x, c, varied, tuple(drawn.tolist())), (i,), name)
+            for i, (x, c, drawn) in enumerate(zip(self.states[:count], self.constants, self.drawn, strict=False))
+        ]
+        found = jobs.run(work, cache.folder(task, params, varied) / f"fresh-{self.seed}", workers)
+        return replace(self, optima=np.array([entry["cost"] for (entry,) in found]))
 
     def episode(self, i: int) -> dict[str, Any]:
         """What episode i was and how it ended, as a line of a table."""
@@ -406,10 +393,11 @@ def check_fresh(policy: Any, task: Task, episodes: int, seed: int, robot: str = 
     _acting(policy, task, robot)
 
 
-def _optimal_cost(*problem: Any) -> float:
+def _optimum(*problem: Any) -> Iterator[jobs.Entry]:
+    """Of one episode, which is named last."""
     from ballbot_baselines.optimum.certification import optimum_of  # it imports CasADi
 
     try:
-        return optimum_of(*problem).cost
+        yield {"cost": optimum_of(*problem[:-1]).cost}
     except PlanError:
-        return math.nan
+        yield {"cost": math.nan}
