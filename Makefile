@@ -11,7 +11,7 @@ SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # imports anew: one that trains takes 6 s to start in place of 2.5.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs notebooks pictures gallery certify clients pythons ray clean
+.PHONY: demo test types pytest test-slow verify bench bench-release soak faults fuzz docs notebooks pictures gallery certify clients pythons ray clean
 .PHONY: platforms code dist cross release metadata
 
 demo: $(VENV)/runs
@@ -39,6 +39,11 @@ verify: $(VENV)/installed
 bench: $(VENV)/installed
 	$(INSTALL) -e ".[bench]"
 	$(BIN)/python benchmarks/page.py
+
+# the same, and the figures go into the table of all releases, benchmarks/releases.csv
+bench-release: $(VENV)/installed
+	$(INSTALL) -e ".[bench]"
+	$(BIN)/python benchmarks/page.py --release
 
 # millions of steps and a thousand environments: time and memory must not grow
 soak: $(VENV)/installed

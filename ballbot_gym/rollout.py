@@ -87,7 +87,9 @@ class Episode(Moving):
 
     `trajectory` holds the applied forces. `cost` includes a failure's price. From `settle_time`, s, the goal held until the
     end; it is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`,
-    `act_seconds` its median wall time in `act`. `markers` are what its task draws.
+    `act_seconds` its median wall time in `act`. `goal_error` is `Task.goal_error` of the last state: how far from the goal
+    the episode ended, in units of the goal's tolerances. `violated` is the name of the limit that was violated, or "".
+    `markers` are what its task draws.
     """
 
     trajectory: Trajectory
@@ -98,10 +100,12 @@ class Episode(Moving):
     settle_time: float
     reset_seconds: float
     act_seconds: float
+    goal_error: float = math.nan
+    violated: str = ""
     markers: tuple[Marker, ...] = ()
 
     def facts(self) -> dict[str, str]:
-        end = "failure" if self.failure else "success" if self.success else "goal missed"
+        end = f"failure: {self.violated}" if self.failure else "success" if self.success else "goal missed"
         settled = "never" if math.isnan(self.settle_time) else f"{self.settle_time:.2f} s"
         return {"end": end, "cost": f"{self.cost:.4g}", "settled": settled}
 
@@ -170,6 +174,8 @@ def rollout(
         settle_time=(last_unsettled + 1) * dt if settled[-1] else math.nan,
         reset_seconds=reset_seconds,
         act_seconds=float(np.median(act_seconds)),
+        goal_error=float(task.goal_error(tuple(x.tolist()), task.at(tuple(c.tolist()), len(forces) * dt))),
+        violated=ballbot.limit_names[info["violated"]] if info["failure"] else "",
         markers=tuple(task.markers(c)),
     )
 

@@ -3,11 +3,16 @@
 Each figure is followed by its ratio to that of the last page of another commit. A benchmark during which other processes took
 more than 5 % of the cores is marked as busy. Finished benchmarks are not repeated for the same commit, so an interrupted page
 continues where it was. With uncommitted changes everything is measured again.
+
+With --release the figures are also written to releases.csv in this folder, the table of all releases. It names the machine
+of each figure, and how busy the machine was with other processes.
 """
 
 import csv
+import io
 import json
 import os
+import platform
 import resource
 import shutil
 import subprocess
@@ -26,6 +31,7 @@ from ballbot_gym import files
 from ballbot_train.work.provenance import commit_of, provenance
 
 _HERE = Path(__file__).parent
+_RELEASES = _HERE / "releases.csv"
 _BUSY = 0.05  # share of the cores that others took
 _MORE_IS_BETTER = {"steps/s", "times"}  # of other units, less is
 
@@ -98,7 +104,11 @@ SECTIONS = (
 
 
 def main(
-    out: Path = Path("runs/bench"), sections: tuple[str, ...] = (), quick: bool = False, previous: Path | None = None
+    out: Path = Path("runs/bench"),
+    sections: tuple[str, ...] = (),
+    quick: bool = False,
+    previous: Path | None = None,
+    release: bool = False,
 ) -> None:
     """Runs the benchmarks, and writes bench.md and its figures.
 
@@ -107,6 +117,7 @@ def main(
         sections: names of the scripts to run; default, all.
         quick: shorter runs, which only show that everything works.
         previous: page to compare with; default, the newest of another commit.
+        release: write the figures into the table of releases too, under the version of the package.
     """
     known = [section.script for section in SECTIONS]
     if unknown := set(sections) - set(known):
@@ -118,6 +129,8 @@ def main(
     for section in SECTIONS:
         if not sections or section.script in sections:
             records.append((section, _measured(section, page / section.script, quick, again)))
+    if release:
+        _record(records, quick)
     before = previous or _newest_other(out, page)
     print(f"written: {files.write(page / 'bench.md', _markdown(page, records, before))}")
 
@@ -154,6 +167,29 @@ def _measured(section: Section, out: Path, quick: bool, again: bool) -> dict[str
     return record
 
 
+def _record(records: Sequence[tuple[Section, dict[str, Any]]], quick: bool) -> None:
+    """Writes the figures into releases.csv; those of the same version and section are replaced."""
+    facts = provenance()
+    of = {
+        "version": facts["version"],
+        "machine": f"{facts['machine']}, {_processor()}",
+        "python": facts["python"],
+        "quick": quick,
+    }
+    new = [
+        of | {"others": round(record["others"], 3), "section": section.script, "row": row, "figure": name}
+        | {"value": value, "unit": section.figures[name]}
+        for section, record in records
+        for row, figures in record["figures"].items()
+        for name, value in figures.items()
+    ]  # fmt: skip
+    again = {(str(row["version"]), row["section"]) for row in new}
+    with _RELEASES.open(newline="") if _RELEASES.exists() else io.StringIO() as lines:
+        kept = [row for row in csv.DictReader(lines) if (row["version"], row["section"]) not in again]
+    files.write_csv(_RELEASES, [*kept, *new])
+    print(f"written: {_RELEASES}")
+
+
 def _figures(section: Section, rows: Sequence[dict[str, str]]) -> dict[str, dict[str, float]]:
     """Figures by row and column; those that a row has not are left out."""
     return {
@@ -184,6 +220,17 @@ def _processor_seconds() -> tuple[float, float]:
     except OSError:
         return own, own
     return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK"), own
+
+
+def _processor() -> str:
+    """The processor's name, as Linux gives it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor()
+    )
 
 
 def _jitter() -> float:

@@ -1,11 +1,14 @@
 """What mkdocs does for the site besides its pages.
 
-`<!-- file: README.md -->` in a page stands for that file of the repository's root, and `<!-- settings -->` for the tables of
-the learners' settings. Pictures are loaded when they come into view. Notebooks are pages with their outputs. The playground's
-page is written anew. The script that sorts the report's tables sorts the site's too.
+`<!-- file: README.md -->` in a page is replaced by that file of the repository's root. `from SOME WORDS` after the name omits
+what precedes these words. `<!-- settings -->` is replaced by the tables of the learners' settings. Every module that a
+page of the API names gets a page of its own. Pictures are loaded when they come into view. Links to films in tables show the
+films. Notebooks are pages with their outputs. The playground's page is written. The script that sorts the report's tables
+sorts the site's too.
 """
 
 import ast
+import importlib
 import inspect
 import itertools
 import json
@@ -23,29 +26,70 @@ from ballbot_train.report.playground import playground_page
 
 _ROOT = Path(__file__).parent.parent
 _SORTS = _ROOT / "train" / "ballbot_train" / "report" / "assets" / "table.js"
-_FILE = re.compile(r"<!-- file: (\S+) -->")
+_FILE = re.compile(r"<!-- file: (\S+)(?: from (.+?))? -->")
+_MODULE = re.compile(r"^::: (\S+)$", flags=re.MULTILINE)
+_FILM = re.compile(r'<a href="([^"]+\.webp)">(\d+)</a>')
 _NOTEBOOK = re.compile(r"\]\((notebooks/[\w-]+)\.ipynb\)")
 _PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for each page.
 
     Raises:
         FileNotFoundError: a page names a file that does not exist.
+        ValueError: the file does not contain the words from which on it is shown.
     """
     markdown = markdown.replace("<!-- settings -->", settings_tables()) if "<!-- settings -->" in markdown else markdown
+    if page.file.src_uri.startswith("api/") and page.file.generated_by is None:
+        markdown = _MODULE.sub(_module_link, markdown)
     markdown = _NOTEBOOK.sub(r"](\1.md)", markdown)
-    return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
+    return _FILE.sub(lambda match: _part_of(match[1], match[2] or ""), markdown)
+
+
+def _part_of(file: str, begin: str) -> str:
+    """The text of a file of the root from some words on, with links of the site."""
+    text = (_ROOT / file).read_text(encoding="utf-8")
+    return _with_links_of_the_site(text[text.index(begin) :])
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Called by mkdocs with each page as HTML: pictures are loaded when they are scrolled to."""
+    """Called by mkdocs with each page as HTML: links to films show them, and pictures are loaded when they come into view."""
+    html = _FILM.sub(r'<a href="\1"><img alt="film of episode \2" src="\1"><br>\2</a>', html)
     return html.replace("<img ", '<img loading="lazy" ')
+
+
+def on_config(config: Any, **_: Any) -> Any:
+    """Called by mkdocs with its settings: the navigation lists the modules of the API below their packages."""
+    config["nav"] = _with_modules(config["nav"], Path(config["docs_dir"]))
+    return config
+
+
+def _with_modules(entry: Any, docs: Path) -> Any:
+    """An entry of the navigation in which every page of the API is followed by the pages of its modules."""
+    if isinstance(entry, list):
+        return [_with_modules(each, docs) for each in entry]
+    if not isinstance(entry, dict):
+        return entry
+    ((title, inside),) = entry.items()
+    if isinstance(inside, str) and inside.startswith("api/"):
+        modules = _MODULE.findall((docs / inside).read_text(encoding="utf-8"))
+        return {title: [inside, *({module: f"api/{module}.md"} for module in modules)]}
+    return {title: _with_modules(inside, docs)}
+
+
+def _module_link(match: re.Match[str]) -> str:
+    """A module of the API as an entry of a list: a link to its page, and the first line of its docstring."""
+    about = (inspect.getdoc(importlib.import_module(match[1])) or "").partition("\n")[0]
+    return f"- [`{match[1]}`]({match[1]}.md): {about}"
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
     """Called by mkdocs with the site's files."""
+    for page in sorted((Path(config["docs_dir"]) / "api").glob("*.md")):
+        for module in _MODULE.findall(page.read_text(encoding="utf-8")):
+            content = f"::: {module}\n    options:\n      heading_level: 1\n"
+            files.append(File.generated(config, f"api/{module}.md", content=content))
     files.append(File.generated(config, "table.js", abs_src_path=str(_SORTS)))
     for path in sorted((Path(config["docs_dir"]) / "notebooks").glob("*.ipynb")):
         files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook_page(path)))

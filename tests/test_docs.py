@@ -313,5 +313,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     start = (tmp_path / "index.html").read_text()
     assert "<!-- file" not in start
     assert "Two commands" in start
+    assert 'href="playground/page.html"' in start
+    assert '<img loading="lazy" alt="film of episode' in (tmp_path / "leaderboard" / "index.html").read_text()
     assert (tmp_path / "playground" / "page.html").stat().st_size > 1e6
-    assert "discrete_lqr" in (tmp_path / "api" / "baselines" / "index.html").read_text()
+    assert "discrete_lqr" in (tmp_path / "api" / "ballbot_baselines.solvers.riccati" / "index.html").read_text()

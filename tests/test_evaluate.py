@@ -18,6 +18,7 @@ from rich.console import Console
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
+from ballbot_gym.robot import named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import controllers, evaluate, runner
 from ballbot_train.evaluation.comparison import compare
@@ -39,6 +40,38 @@ def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():
     assert row.success == pytest.approx(1 / 3)
     assert row.regret_mean == pytest.approx(0.3)
     assert row.cost_mean == pytest.approx((12 + 14 + 1010) / 3)
+
+
+def test_a_row_says_how_many_stand_beside_the_goal():
+    lqr = CONTROLLERS["lqr"](make_task("stabilize"), named_robot("paper"))
+
+    def standing_at(place):
+        offset = np.r_[place, 0.0, np.zeros(6)]
+        return SimpleNamespace(reset=lqr.reset, act=lambda t, x: lqr.act(t, x - offset))
+
+    row = ballbot_train.evaluate(standing_at(0.12), "stabilize", 3, physics="rk4")  # the goal is a circle of 0.1 m
+    assert (row.success, row.near) == (0.0, 1.0)
+    assert row.facts()["in or near the goal"] == "100 %"
+    assert TABLE["success"](row) == "0.0 % (100.0 % near)"
+    assert ballbot_train.evaluate(standing_at(0.4), "stabilize", 3, physics="rk4").near == 0.0
+    row = ballbot_train.evaluate(standing_at(0.0), "stabilize", 3, physics="rk4")
+    assert (row.success, row.near) == (1.0, 1.0)
+    assert TABLE["success"](row) == "100.0 %"
+
+
+def test_a_row_warns_where_an_optimum_is_nearly_zero_and_has_the_excess():
+    ordinary = [result(episode=i, cost=11.0, optimum=10.0) for i in range(3)]
+    assert leaderboard(ordinary)[0].excess_mean == pytest.approx(1.0)
+    with pytest.warns(UserWarning, match="in 1 of 4 episodes the optimum costs less than 1% of the mean optimum"):
+        (row,) = leaderboard([*ordinary, result(episode=3, cost=1.0, optimum=1e-3)])
+    assert row.regret_mean > 200
+    assert row.excess_mean == pytest.approx(3.999 / 4)
+
+
+def test_a_failure_is_not_near_the_goal_and_an_end_that_is_not_known_gives_no_share():
+    ends = [result(goal_error=1.2, success=False), result(goal_error=2.0, success=False, failure=True)]
+    assert leaderboard(ends)[0].near == 0.5
+    assert math.isnan(leaderboard([*ends, result()])[0].near)
 
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path):

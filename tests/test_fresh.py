@@ -162,6 +162,19 @@ def test_what_does_not_act_is_refused():
         evaluate_fresh("apg", "turn", 1)
 
 
+def test_fresh_episodes_and_training_say_how_many_stand_beside_the_goal():
+    task = TASKS["stabilize"]()
+    policy = load_policy(shipped_policies(task)["shac"])
+    beside = torch.zeros(8)
+    beside[0] = 0.12 / task.observation_scale[0]  # m; the goal is a circle of 0.1 m
+    found = evaluate_fresh(lambda seen: policy.network(seen - beside), "stabilize", 20)
+    assert not found.success.any()
+    assert found.summary().near == 1.0
+    assert found.goal_errors == pytest.approx(np.full(20, 1.2), rel=0.1)
+    figures = training.score_and_validate(lambda seen: policy.network(seen - beside), task, episodes=1)
+    assert (figures["certified/success"], figures["certified/near"]) == (0.0, 1.0)
+
+
 def test_validation_prices_an_episode_without_success_as_failing_at_once():
     task = TASKS["stabilize"]()
     figures = training.score_and_validate(idle, task)

@@ -302,6 +302,17 @@ class Task(ABC):
         """What to draw besides the robot."""
         return []
 
+    def goal_error(self, x: Vector, c: Vector) -> Any:
+        """How far a state is from the goal, in units of the goal's tolerances: at most 1 in the goal.
+
+        It is the largest error over its tolerance where each entry of `goal` is (error / tolerance)² − 1, as in all tasks of
+        this package.
+        """
+        largest, *others = self.goal(x, c)
+        for excess in others:
+            largest = ops.maximum(largest, excess)
+        return ops.sqrt(ops.clip(largest + 1.0, 0.0, math.inf))
+
     def is_goal(self, x: Vector, c: Vector) -> bool:
         """Whether one state is in the goal."""
         return all(excess <= 0 for excess in self.goal(x, c))

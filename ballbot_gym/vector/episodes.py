@@ -26,6 +26,8 @@ class BatchEpisodes(NamedTuple):
     """(B,) int64 index in the batch's `limit_names` of the limit at which the episode ended, else −1."""
     steps: torch.Tensor
     """(B,) int64, control steps taken."""
+    goal_error: torch.Tensor
+    """(B,) how far from the goal the episode ended, in units of the goal's tolerances; see `Task.goal_error`."""
 
 
 @torch.no_grad()
@@ -55,6 +57,8 @@ def run_episodes(
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
     steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
     violated = torch.full_like(steps, -1)
+    assert batch.state is not None
+    end, constants = batch.state.x, batch.state.c
     for _ in range(batch.task.steps):
         result = batch.step(policy(observation))
         observation = result.observation
@@ -62,7 +66,10 @@ def run_episodes(
         steps += running
         success |= running & result.success
         violated = torch.where(running & result.failure, result.violated, violated)
+        end = torch.where(running, result.final_x, end)
         running &= ~(result.terminated | result.truncated)
         if not running.any():
             break
-    return BatchEpisodes(cost, success, violated >= 0, violated, steps)
+    c_end = batch.task.at(constants.unbind(0), steps.to(batch.dtype) * batch.task.control_dt)
+    goal_error = batch.task.goal_error(end.unbind(0), c_end)
+    return BatchEpisodes(cost, success, violated >= 0, violated, steps, goal_error)

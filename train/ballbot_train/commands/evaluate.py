@@ -162,6 +162,7 @@ def _print(result: Any, worst: Sequence[dict[str, Any]]) -> None:
     failed_by = ", ".join(f"{count} {name}" for name, count in row.failed_by.items())
     facts = [
         ["success [95 %]", f"{100 * row.success:.2f} % [{100 * row.success_low:.2f}, {100 * row.success_high:.2f}]"],
+        *([["in the goal or near it", f"{100 * row.near:.2f} %"]] if row.near > row.success else []),
         [
             "failures per 10,000 [95 %]",
             f"{row.failures_per_10000:.1f} [{row.failures_per_10000_low:.1f}, {row.failures_per_10000_high:.1f}]"

@@ -30,7 +30,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
 from ballbot_train.evaluation.controllers import as_controller, is_expert, make_controller
-from ballbot_train.evaluation.results import to_json
+from ballbot_train.evaluation.results import near_share, to_json, warn_of_small
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work import jobs
@@ -71,6 +71,8 @@ class _Summary:
     cost_median: float
     cost_p99: float
     cost_worst: float
+    near: float
+    """Share of the episodes that ended in the goal or near it, within `results.NEAR` times its tolerances."""
     optima: int = 0
     """Episodes whose optimum is known: of those that did not fail, the regrets."""
     regret_mean: float = math.nan
@@ -100,6 +102,8 @@ class FreshResult:
     """The limit at which each episode ended, or ""."""
     durations: np.ndarray
     """(n,) s."""
+    goal_errors: np.ndarray
+    """(n,) how far from the goal the episodes ended, in units of its tolerances: at most 1 in the goal."""
     measures: dict[str, np.ndarray]
     """The result of `Task.measures` for each episode."""
     optima: np.ndarray
@@ -122,7 +126,8 @@ class FreshResult:
         return regrets[np.isfinite(regrets)]
 
     def summary(self) -> _Summary:
-        """The numbers."""
+        """The numbers. Warns as `results.leaderboard`."""
+        warn_of_small(self.optima)
         n, failures = len(self), int(self.failure.sum())
         success = int(self.success.sum())
         success_low, success_high = share_interval(success, n)
@@ -139,6 +144,7 @@ class FreshResult:
             failures_per_10000_high=1e4 * failures_high,
             failed_by={kind: kinds.count(kind) for kind in sorted(set(kinds))},
             **_spread("cost", self.costs),
+            near=near_share(self.goal_errors, self.failure),
             optima=int(np.isfinite(self.optima).sum()),
             **_spread("regret", self.regrets),
         )
@@ -187,6 +193,7 @@ class FreshResult:
             "failure": bool(self.failure[i]),
             "failed": ending,
             "duration": float(self.durations[i]),
+            "goal_error": float(self.goal_errors[i]),
             **{name: float(values[i]) for name, values in self.measures.items()},
         }
 
@@ -376,6 +383,7 @@ def evaluate_fresh(
         failure=torch.cat([run.failure for run in runs]).numpy(),
         violated=tuple(names[number] if number >= 0 else "" for number in numbers),
         durations=torch.cat([run.steps for run in runs]).numpy() * task.control_dt,
+        goal_errors=torch.cat([run.goal_error for run in runs]).numpy(),
         measures={key: np.array([entry[key] for entry in described]) for key in described[0]} | vary,
         optima=np.zeros(0),
         drawn=drawn,

@@ -2,6 +2,8 @@
 
 import json
 import math
+import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -16,6 +18,10 @@ from ballbot_train.evaluation.names import shortened, with_way
 from ballbot_train.evaluation.statistics import interval
 
 _LEADERBOARD = "leaderboard"
+SMALL = 0.01
+"""An optimum below this share of the mean optimum is nearly 0."""
+NEAR = 3.0
+"""An episode without failure ends near the goal if its end is within so many times the goal's tolerances."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,10 @@ class Result:
     step_seconds: float = math.nan
     effort: float = math.nan
     """Mean of |F| over the episode, N."""
+    goal_error: float = math.nan
+    """How far from the goal the episode ended, in units of the goal's tolerances: at most 1 in the goal."""
+    violated: str = ""
+    """Name of the limit at which the episode failed, such as "tilt"."""
     note: str = ""
     """Why there is no trajectory: the message of the controller that found no plan."""
     labels: Mapping[str, Any] = field(default_factory=dict)
@@ -50,7 +60,7 @@ class Result:
 
 @dataclass(frozen=True, repr=False)
 class Row(Displayed):
-    """A leaderboard row. Regret, peak tilt, settle time and effort are of the episodes that did not fail."""
+    """A leaderboard row. Regret, excess, peak tilt, settle time and effort are of the episodes that did not fail."""
 
     task: str
     controller: str
@@ -59,11 +69,17 @@ class Row(Displayed):
     episodes: int
     success: float
     falls: int
+    failed_by: str
+    """How many episodes failed at which limit, such as "60 tilt, 4 arena"."""
+    near: float
+    """Share of the episodes that ended in the goal or near it, within `NEAR` times its tolerances; NaN if it is not known."""
     regret_mean: float
     regret_low: float
     """Of the mean's 95 % bootstrap interval."""
     regret_high: float
     regret_median: float
+    excess_mean: float
+    """Mean of cost − optimum, in the unit of the cost: what to look at where some optima are nearly 0."""
     cost_mean: float
     cost_median: float
     peak_tilt_median: float
@@ -82,13 +98,48 @@ class Row(Displayed):
             "physics": self.physics,
             "episodes": f"{self.episodes}",
             "success": f"{100 * self.success:.4g} %",
-            "failures": f"{self.falls}",
+            **({"in or near the goal": f"{100 * self.near:.4g} %"} if self.near > self.success else {}),
+            "failures": f"{self.falls}" + (f" ({self.failed_by})" if self.failed_by else ""),
             "mean regret": _percent(self.regret_mean),
         }
 
 
+def warn_of_small(optima: Sequence[float] | np.ndarray) -> None:
+    """Warns where optimal costs are nearly 0 next to the others, so that the mean regret is that of a few episodes."""
+    known = np.asarray(optima)[np.isfinite(optima)]
+    small = int((known < SMALL * known.mean()).sum()) if known.size else 0
+    if small:
+        warnings.warn(
+            f"in {small} of {known.size} episodes the optimum costs less than {SMALL:.0%} of the mean optimum, so that their "
+            "regrets decide the mean: compare regret_median, or excess_mean, the mean of cost − optimum",
+            stacklevel=3,
+        )
+
+
+def counted(violated: Iterable[str]) -> str:
+    """How many episodes failed at which kind of limit, the most frequent first; their other entries are ""."""
+    kinds = Counter(name.partition(" ")[0] for name in violated if name)  # "obstacle 3" is an obstacle
+    return ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+
+
+def near_share(goal_errors: Sequence[float] | np.ndarray, failure: Sequence[bool] | np.ndarray) -> float:
+    """Share of episodes that ended without failure within `NEAR` times the goal's tolerances; NaN if an end is not known."""
+    near = np.where(failure, 0.0, np.asarray(goal_errors) <= NEAR)
+    unknown = np.isnan(goal_errors) & ~np.asarray(failure)
+    return math.nan if unknown.any() else float(near.mean())
+
+
+def success_text(success: float, near: float, digits: int = 1) -> str:
+    """A success rate in per cent; where more episodes ended near the goal, followed by their share."""
+    text = f"{100 * success:.{digits}f} %"
+    return f"{text} ({100 * near:.{digits}f} % near)" if near > success else text
+
+
 def _row(results: Sequence[Result], seed: int) -> Row:
-    """The leaderboard row of one controller on one task; seed is of the bootstrap."""
+    """The leaderboard row of one controller on one task; seed is of the bootstrap.
+
+    Warns where the optimum of an episode is nearly 0 next to the others: the mean regret says little then.
+    """
     standing = [result for result in results if not result.failure]
 
     def median(values: Iterable[float]) -> float:
@@ -96,6 +147,7 @@ def _row(results: Sequence[Result], seed: int) -> Row:
         return float(np.median(finite)) if finite else math.nan
 
     regrets = [result.regret for result in standing]
+    warn_of_small([result.optimum for result in results])
     low, high = interval(regrets, seed)
     return Row(
         task=results[0].task,
@@ -104,10 +156,13 @@ def _row(results: Sequence[Result], seed: int) -> Row:
         episodes=len(results),
         success=float(np.mean([result.success for result in results])),
         falls=len(results) - len(standing),
+        failed_by=counted(result.violated for result in results),
+        near=near_share([result.goal_error for result in results], [result.failure for result in results]),
         regret_mean=float(np.mean(regrets)) if regrets else math.nan,
         regret_low=low,
         regret_high=high,
         regret_median=median(regrets),
+        excess_mean=float(np.mean([each.cost - each.optimum for each in standing])) if standing else math.nan,
         cost_mean=float(np.mean([result.cost for result in results])),
         cost_median=median(result.cost for result in results),
         peak_tilt_median=median(result.peak_tilt for result in standing),
@@ -229,8 +284,8 @@ TABLE: dict[str, Callable[[Row], str]] = {
     "task": lambda row: row.task,
     "controller": lambda row: row.controller,
     "physics": lambda row: row.physics,
-    "success": lambda row: f"{100 * row.success:.1f} %",
-    "falls": lambda row: f"{row.falls}/{row.episodes}",
+    "success": lambda row: success_text(row.success, row.near),
+    "falls": lambda row: f"{row.falls}/{row.episodes}" + (f" ({row.failed_by})" if row.failed_by else ""),
     "regret mean": lambda row: with_interval(row.regret_mean, row.regret_low, row.regret_high),
     "regret median": lambda row: _percent(row.regret_median),
     "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),

@@ -306,7 +306,7 @@ def run_episodes(
                 run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=known.options(i))
         except PlanError as error:
             measures: dict[str, Any] = {"cost": env.task.survival_pay, "note": str(error)}
-            measures |= {"success": False, "failure": True}
+            measures |= {"success": False, "failure": True, "violated": "no plan"}
         else:
             measures = {
                 "cost": run.cost,
@@ -317,6 +317,8 @@ def run_episodes(
                 "duration": run.trajectory.duration,
                 "plan_seconds": run.reset_seconds,
                 "step_seconds": run.act_seconds,
+                "goal_error": run.goal_error,
+                "violated": run.violated,
                 "effort": float(np.hypot.reduce(run.trajectory.u, axis=1).mean()),
             }
         if motions is not None:

@@ -11,6 +11,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.tasks import Task
+from ballbot_train.evaluation.results import success_text
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate
 from ballbot_train.policy.saved_models import mark
@@ -88,9 +89,10 @@ class RegretCallback(BaseCallback):
                 self.logger.record(name, value)
         self.logger.dump(self.num_timesteps)
         if self.verbose:
+            success = success_text(figures["certified/success"], figures["certified/near"])
             print(
                 f"{self.num_timesteps} steps: regret {figures['certified/regret_mean']:.2%} (worst "
-                f"{figures['certified/regret_worst']:.2%}), success {figures['certified/success']:.1%}"
+                f"{figures['certified/regret_worst']:.2%}), success {success}"
             )
         self.best = min(self.evaluations, key=_order)
         if self.save_path is not None:

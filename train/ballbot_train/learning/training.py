@@ -23,8 +23,8 @@ A run is a folder:
 |---|---|
 | iteration, seconds | of training; seconds without evaluations |
 | env_steps, cpu_seconds | control steps of all envs, where the learner counts them; CPU time without evaluations |
-| cost_ratio, regret_mean, _median and _worst, success, failures | on the certified episodes, the test set |
-| validation_cost, validation_success, validation_failures, validation_mean_cost | on the validation set |
+| cost_ratio, regret_mean, _median and _worst, success, near, failures | on the certified episodes, the test set |
+| validation_cost, _success, _near, _failures and _mean_cost | on the validation set |
 
 `score_and_validate` says what these are. The best policy is that of the least validation_cost, and of the least
 validation_mean_cost among equals.
@@ -53,7 +53,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import digest, problem_parts
 from ballbot_train.evaluation import fresh, runner
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.evaluation.results import Row, leaderboard
+from ballbot_train.evaluation.results import Row, leaderboard, near_share, success_text
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
 from ballbot_train.policy.files import PolicyFile
@@ -105,8 +105,8 @@ class Learner(Protocol):
 
 _COLUMNS = (
     *("iteration", "seconds", "env_steps", "cpu_seconds"),
-    *("cost_ratio", "regret_mean", "regret_median", "regret_worst", "success", "failures"),
-    *("validation_cost", "validation_success", "validation_failures", "validation_mean_cost"),
+    *("cost_ratio", "regret_mean", "regret_median", "regret_worst", "success", "near", "failures"),
+    *("validation_cost", "validation_success", "validation_near", "validation_failures", "validation_mean_cost"),
 )
 """Of evaluations.csv."""
 
@@ -127,9 +127,10 @@ def score_and_validate(
     | certified/cost_ratio | mean of cost / optimum; an episode without success costs at least as much as failing at once |
     | certified/regret_mean, regret_median, regret_worst | of cost / optimum − 1 of the episodes that did not fail |
     | certified/success, failures | share of the episodes that ended in success, and number of those that failed |
+    | certified/near | share of those that ended in the goal or near it, within `results.NEAR` times its tolerances |
     | validation/cost | mean cost; an episode without success costs at least as much as failing at once |
     | validation/mean_cost | mean cost as it is, which ranks near misses where no episode succeeds |
-    | validation/success, failures | as on the certified episodes |
+    | validation/success, near, failures | as on the certified episodes |
     """
     known = certified.load(task, robot, randomization=randomization)
     count = len(known)
@@ -140,6 +141,7 @@ def score_and_validate(
     drawn, states, constants = map(np.concatenate, ((own, robots), (known.states, x), (known.constants, c)))
     run = fresh.run_policy(policy, task, states, constants, drawn, robot, randomization)
     cost, success, failure = run.cost.double().numpy(), run.success.numpy(), run.failure.numpy()
+    goal_error = run.goal_error.double().numpy()
     priced = fresh.priced(cost, success, task)
     standing = (cost[:count] / known.costs - 1)[~failure[:count]]
     mean, median, worst = (float(of(standing)) if standing.size else math.nan for of in (np.mean, np.median, np.max))
@@ -149,9 +151,11 @@ def score_and_validate(
         "certified/regret_median": median,
         "certified/regret_worst": worst,
         "certified/success": float(success[:count].mean()),
+        "certified/near": near_share(goal_error[:count], failure[:count]),
         "certified/failures": int(failure[:count].sum()),
         "validation/cost": float(priced[count:].mean()),
         "validation/success": float(success[count:].mean()),
+        "validation/near": near_share(goal_error[count:], failure[count:]),
         "validation/failures": int(failure[count:].sum()),
         "validation/mean_cost": float(cost[count:].mean()),
     }
@@ -233,7 +237,7 @@ class _Run:
             best = PolicyNetwork(self.learner.network.spec)
             best.load_state_dict(state["policy"])
             self.seconds = float(state["seconds"])
-            self.rows = [{name: row[name] for name in _COLUMNS} for row in state["rows"]]
+            self.rows = [{name: row.get(name, math.nan) for name in _COLUMNS} for row in state["rows"]]
             self.cpu_seconds = float(state["cpu_seconds"])
         except MemoryError:
             raise
@@ -308,7 +312,8 @@ class _Run:
         best = self._chosen
         regret = "no regret yet" if math.isnan(best["regret_mean"]) else f"{best['regret_mean']:.1%} regret"
         failures = f"{best['validation_failures']} of {self.validation_episodes} fail"
-        return f"{regret}, {best['validation_success']:.1%} success, {failures}"
+        success = success_text(best["validation_success"], best.get("validation_near", math.nan))
+        return f"{regret}, {success} success, {failures}"
 
     def save(self) -> None:
         """Writes the checkpoint, with the best policy in it, so that both are of the same iteration."""
