@@ -4,6 +4,7 @@ import dataclasses
 import math
 import sys
 from collections.abc import Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -24,7 +25,7 @@ from ballbot_gym.drawing.picture import picture
 from ballbot_gym.drawing.viewer import Viewer, can_show, need_library
 from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.machine_code import step_code
+from ballbot_gym.machine_code.single import StepCode, StepProblem, step_code
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robot import (
     PAPER,
@@ -33,16 +34,31 @@ from ballbot_gym.robot import (
     checked_randomization,
     checked_robot,
     named_robot,
-    needed_friction,
     own_fields,
     sensors,
 )
-from ballbot_gym.step import ENGINE, Outcome, check_observation, limit_names, observation_space, outcome
+from ballbot_gym.step import (
+    ENGINE,
+    Draws,
+    Outcome,
+    Step,
+    StepState,
+    applied,
+    by_engine,
+    check_observation,
+    closed_form,
+    limit_names,
+    observation_space,
+    observe,
+    start,
+    start_draws,
+    step,
+)
 from ballbot_gym.tasks import TASKS, Task
 
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
-_NOTHING_DONE = Outcome(0.0, -0.0, *(0.0,) * 5, violated=-1.0)  # whose reward_cost is 0.0
 _FLOAT32 = np.dtype(np.float32)
+_NOTHING_DONE = Outcome(*(0.0,) * 9, violated=-1.0)
 
 
 class EnvState(NamedTuple):
@@ -185,7 +201,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
                 the extra "play".
         """
         self._page: Viewer | None = None
-        self._state: State = ()  # until the first reset
+        self._now: StepState | None = None  # until the first reset
         self.params = robot_of(task, robot, params)
         physics = checked_physics(physics, self.params)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -197,31 +213,40 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self.render_mode = render_mode
         modes, fps = ["human", "rgb_array"] if can_show() else ["rgb_array"], round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
+        dt = self.task.control_dt
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.randomization = checked_randomization(randomization, self.params)
         self._robot = self.params  # of the episode
-        self._drawn: State = ()
-        self._resting = self.randomization.resting((0.0,) * self.params.action_size, self.task.control_dt)
-        self._actuator = self._resting
         self.observation = check_observation(observation, self.params, self.randomization)
-        self._sensors: tuple[float, ...] = ()
-        self._noisy = self.randomization.is_noisy or self.observation == "sensors"
+        self.randomization.delay_steps(dt)  # raises an error where it is no whole number of these
         self.history = check_history(history)
         self.observation_space = observation_space(self.task, self.params, self.history, self.observation)
-        self._past = self._tried = np.zeros(0)  # the last observation with a history, and the action on it
-        self._physics_dt, self._may_lose = physics_dt, physics != "rk4"
-        self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
-        self._judge: step_code.Judge | None = None
-        self._resets = 0
-        self._constants: tuple[float, ...] = ()
-        self._constants_array = np.zeros(0)
-        # read in every step or reset
-        self._remembers, self._varies = self.history > 0, self.randomization.varies_episodes
-        self._random, self._varies_robot = self.randomization.active, self.randomization.varies_robot
-        self._action_shape = self.action_space.shape
-        self._steps, self._survive = self.task.steps, self.task.survival_reward * self.task.control_dt
-        self._grips, self._force_limit, self._human = self.params.grips, self.params.force_limit, render_mode == "human"
-        self._steps_left = self._taken = 0
+        self._past = np.zeros(0)  # the last observation with a history
+        self._physics_dt, self._engine = physics_dt, physics != "rk4"
+        self._contact = self._engine and self.params.CONTACT and self.params.grips
+        self._simulator = make_simulator(physics, self.params, dt, physics_dt)
+        self._substeps = self._simulator.substeps if isinstance(self._simulator, Rk4Simulator) else 0
+        self.step_problem = StepProblem(
+            self.task,
+            self.params.kind,
+            self.randomization,
+            self.observation == "sensors",
+            self._substeps,
+            self._contact,
+        )
+        self._code: StepCode | None = None
+        self._constants, self._measured = np.zeros(0), tuple(each.name for each in self.params.MEASUREMENTS)
+        # read in every step
+        self._senses, self._varies = self.observation == "sensors", self.randomization.varies_episodes
+        self._draws = Draws(
+            (0.0,) * (Randomization.PUSH_DRAWS * self.randomization.pushes),
+            (0.0,) * (sensors.DRAWS * self._senses),
+            (0.0,) * (Randomization.NOISE_DRAWS * self.randomization.is_noisy),
+        )
+        self._random = any(self._draws)
+        self._start_draws = start_draws(self.task, self.randomization, self._senses)
+        self._action_shape, self._human = self.action_space.shape, render_mode == "human"
+        self._steps_left = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -240,26 +265,17 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         super().reset(seed=seed)
         draws = ("drawn",) if self._varies else ()
         state, constants, *drawn = reset_options(options, "state", "constants", *draws)
-        x, c = self._draw(state, constants)
-        self._resets += 1
-        self._use_code()
-        judge, measured = self._start(x, c)
-        self._set_constants(c)
-        self._state = x
-        if self._random:
-            z = tuple(self.np_random.random(self.randomization.episode_draws).tolist())
-            self._drawn, self._actuator = self.randomization.draw(z, self.task.control_dt), self._resting
-            for given in drawn:
-                if given is not None:
-                    self._drawn = _floats(finite_array(given, (len(z),), "drawn"))
-        self._restore_simulator()
-        if self.observation == "sensors":
-            z = tuple(self.np_random.random(sensors.FIRST_DRAWS).tolist())
-            self._sensors = sensors.first(self.episode_params, x, z, self.task.control_dt)
-        self._steps_left, self._taken = self._steps, 0
+        now = self._started(state, constants, drawn[0] if drawn else None)
+        self._begin(now)
+        self._steps_left = self.task.steps
         if self._human:
             self.render()
-        return self._shown(judge, (*_NOTHING_DONE, *measured), 0.0, (0.0,) * self.params.action_size)
+        z = tuple(self.np_random.random(len(self._draws.noise)).tolist()) if self._random else ()
+        seen = observe(self.task, self.params, self.randomization, now, z)
+        grip = _NO_GRIP if self.params.grips else ()
+        begun = Step(now, _NOTHING_DONE, (0.0,) * self.params.action_size, 0.0, grip)
+        arrays = np.array(now.x), np.array(begun.force)
+        return self._with_past(np.array(seen, np.float32)), self._info(begun, self.params.measurements(now.x), *arrays)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -276,52 +292,52 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if self._steps_left <= 0:
             self._check_open()
             raise gymnasium.error.ResetNeeded(
-                "the episode has ended; call reset()" if self._state else "step() before reset()"
+                "the episode has ended; call reset()" if self._now else "step() before reset()"
             )
-        force, clipped = self._force(action)
-        total = force
-        if self._drawn:
-            noise = self.randomization
-            force, self._actuator = noise.actuate(force, self._drawn, self._actuator)
-            total = force
-            if noise.pushes:
-                z = tuple(self.np_random.random(Randomization.PUSH_DRAWS).tolist())
-                total = tuple([f + push for f, push in zip(force, noise.push(z, self.task.control_dt), strict=True)])
-        if self._remembers:
-            self._tried = np.asarray(action, np.float64).clip(-1.0, 1.0).astype(_FLOAT32)
-        before = self._state
-        x = self._simulator.step(total)
-        lost = self._may_lose and (not math.isfinite(sum(x)) or self._simulator.is_unstable())
-        self._state = x = before if lost else x
-        if self._sensors:
-            z = tuple(self.np_random.random(sensors.DRAWS).tolist())
-            self._sensors = sensors.following(
-                self.episode_params, self._sensors, before, total, x, z, self.task.control_dt
-            )
+        parts = self._checked(action)
+        made, measured, seen, *arrays = self._advance(parts)
+        self._now, did = made.state, made.outcome
         self._steps_left -= 1
-        grip, kept = _NO_GRIP, 0.0
-        if self._grips and not lost:
-            grip, kept = self._grip(before, total)
-        self._taken = steps = self._steps - self._steps_left
-        judge = self._judge
-        did = None if judge is None or lost else judge.judge(before, force, x, steps, kept)
-        if did is None:
-            judge = None
-            end = outcome(self.task, before, force, x, self._constants, steps, (-1.0 if lost else kept,))
-            end = end._replace(violated=len(self.limit_names) - 1) if lost else end
-            did = *end, *self.params.measurements(x)
-        terminated = did[3] > 0
+        terminated = did.terminated > 0
         if terminated:
             self._steps_left = 0
         if self._human:
             self.render()
-        seen, info = self._shown(judge, did, self._survive, force, clipped, grip)
-        return seen, self._survive - did[1] + did[2], terminated, did[4] > 0, info
+        info = self._info(made, measured, *arrays)
+        return self._with_past(seen, parts), did.reward, terminated, did.truncated > 0, info
+
+    def _advance(self, action: tuple[float, ...]) -> tuple[Step, State, np.ndarray, np.ndarray, np.ndarray]:
+        """A control step, and measurements, (no,) float32 observation, state and force after it."""
+        assert self._now is not None
+        task, now, code, z = self.task, self._now, self._code, self._draws
+        if self._random:
+            z = _split(self.np_random, z)
+        moved = self._simulated(now, action, z) if self._engine else None
+        if code is not None:
+            made, measured = code.step(now, action, z, moved)
+            return made, measured, code.seen.astype(_FLOAT32), code.x.copy(), code.force.copy()
+        dt = task.control_dt
+        move = by_engine(*moved, dt) if moved else closed_form(dt, self._substeps)
+        made = step(task, self.params, self.randomization, now, action, z, move, self._robot)
+        after = made.state
+        seen = np.array(observe(task, self.params, self.randomization, after, z.noise), np.float32)
+        return made, self.params.measurements(after.x), seen, np.array(after.x), np.array(made.force)
+
+    def _simulated(self, now: StepState, action: tuple[float, ...], z: Draws) -> tuple[State, tuple[float, ...], float]:
+        """The engine's control step: the state after it, the floor's force where it is simulated, and ≥ 0 if it is stable."""
+        simulator = self._simulator
+        _, total, _ = applied(self.params, self.randomization, now, action, z.push, self.task.control_dt)
+        x, floor = simulator.step(total), ()
+        if not math.isfinite(sum(x)) or simulator.is_unstable():
+            return now.x, (0.0, 0.0, 0.0) if self._contact else (), -1.0
+        if self._contact:
+            floor = simulator.floor_force() or ()
+        return x, floor, 0.0
 
     @property
     def limit_names(self) -> tuple[str, ...]:
         names = super().limit_names
-        return (*names, ENGINE) if self._may_lose else names
+        return (*names, ENGINE) if self._engine else names
 
     @property
     def episode_params(self) -> Robot:
@@ -340,10 +356,10 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the environment with render_mode="rgb_array"')
             return None
-        if not self._state:
+        if self._now is None:
             raise gymnasium.error.ResetNeeded("render() before reset()")
-        markers = tuple(self.task.markers(self._constants_array))
-        drawing = Drawing(self.params, (Drawn(np.array(self._state)),), markers=markers)
+        markers = tuple(self.task.markers(self._constants))
+        drawing = Drawing(self.params, (Drawn(np.array(self._now.x)),), markers=markers)
         if self.render_mode == "rgb_array":
             return picture(drawing)
         if self._page is None:
@@ -360,15 +376,12 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
-        if not self._state:
+        if self._now is None:
             raise gymnasium.error.ResetNeeded("get_state() before reset()")
-        rng, memory, past = (
-            dict(self.np_random.bit_generator.state),
-            self._simulator.memory(),
-            tuple(self._past.tolist()),
-        )
-        held = self._state, self._constants, self._steps_left, rng, self._drawn, self._actuator, memory, past
-        return EnvState(self.task, *held, self._sensors)
+        x, c, _, drawn, actuator, read = self._now
+        rng, memory = dict(self.np_random.bit_generator.state), self._simulator.memory()
+        past = tuple(self._past.tolist())
+        return EnvState(self.task, x, c, self._steps_left, rng, drawn, actuator, memory, past, read)
 
     def set_state(self, state: EnvState) -> None:
         """Continues from a state that `get_state` of this env returned, or `get_state` of an env with the same arguments.
@@ -386,32 +399,30 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
         observed = len(state.past), bool(state.sensors)
         size = sum(self.observation_space.shape or ()) if self.history else 0
-        if (bool(state.drawn), *observed) != (self.randomization.active, size, self.observation == "sensors"):
+        if (bool(state.drawn), *observed) != (self._varies, size, self._senses):
             raise ValueError("the state is of an env with another randomization, history or observation")
-        self._drawn, self._actuator, self._sensors = state.drawn, state.actuator, state.sensors
         self._past = np.array(state.past, np.float32)
-        self._set_constants(state.constants)
-        self._state, self._steps_left = state.x, state.steps_left
-        self._taken = self.task.steps - state.steps_left
+        self._steps_left = state.steps_left
         self.np_random.bit_generator.state = state.rng
-        self._restore_simulator(state.memory)
+        steps = self.task.steps - state.steps_left
+        self._begin(
+            StepState(state.x, state.constants, steps, state.drawn, state.actuator, state.sensors), state.memory
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         self.np_random  # noqa: B018  an env that was never seeded is seeded here, so that its copy draws the same episodes
-        kept = {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_page", "_judge")}
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_page", "_code")}
         return kept | {"_memory": () if self.closed else self._simulator.memory()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         memory = state.pop("_memory")
         self.__dict__.update(state)
-        self._page = self._judge = None
+        self._page = self._code = None
         self._simulator = make_simulator(self.physics, self.params, self.task.control_dt, self._physics_dt)
         if self.closed:
             self._simulator.close()
-        elif self._state:
-            self._use_code()
-            self._set_constants(self._constants)
-            self._restore_simulator(memory)
+        elif self._now is not None:
+            self._begin(self._now, memory)
 
     def close(self) -> None:
         """Releases the physics client and the page; may be called again."""
@@ -422,132 +433,91 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             self._page.close()
             self._page = None
 
-    def _set_constants(self, c: State) -> None:
-        """Makes c the constants of the episode."""
-        self._constants, self._constants_array = c, np.array(c, np.float64)
-        if self._judge is not None:
-            self._judge.c[:] = c
-
-    def _use_code(self) -> None:
-        """Takes machine code if there is some, from the second episode on. `_set_constants` must follow."""
-        if self._resets < 2:
-            return  # an env of one episode is not worth a compilation
-        if isinstance(self._simulator, Rk4Simulator):
-            self._simulator.use_code()
-        if self._judge is None:
-            self._judge = step_code.judge(self.task, self.params)
-
-    def _restore_simulator(self, memory: tuple[float, ...] = ()) -> None:
-        """Puts the simulator into the env's state, and what it remembers besides into its memory."""
-        if self._varies_robot:
-            self._robot = self.randomization.robot(self.params, self._drawn)
+    def _begin(self, now: StepState, memory: tuple[float, ...] = ()) -> None:
+        """Continues from a state, with what the simulator remembers besides."""
+        self._now, self._constants = now, np.array(now.c, np.float64)
+        if self.randomization.varies_robot:
+            self._robot = self.randomization.robot(self.params, now.drawn)
             self._simulator.set_params(self._robot)
-        self._simulator.reset(self._state, memory)
+        self._simulator.reset(now.x, memory)
+        if self._code is None:
+            self._code = step_code(self.step_problem, self.params)
+        if self._code is not None:
+            self._code.begin(now.c, now.drawn, self.params, self._robot)
 
-    def _grip(self, x: State, total: tuple[float, ...]) -> tuple[tuple[float, ...], float]:
-        """What `info` reports as "grip" of a step from state x, and a limit that is ≥ 0 if the robot kept its grip."""
-        simulated = self._simulator.floor_force()
-        if simulated is not None:
-            return (*simulated, needed_friction(simulated)), 0.0
-        grip, limits = self.episode_params.held(x, total, self.task.control_dt)
-        return grip, min(limits)
-
-    def _start(self, x: State, c: State) -> tuple[step_code.Judge | None, State]:
-        """Who judged a start, if machine code did, and its measurements. Raises a ValueError if it is out of range."""
-        if self._judge is not None:
-            self._judge.c[:] = c
-            did = self._judge.judge(x, (0.0,) * self.params.action_size, x, 0, 0.0)
-            if did is not None and did[7] < 0:
-                return self._judge, did[8:]
-            if self._state:  # the episode of the env continues if this one cannot start
-                self._judge.c[:] = self._constants
-        task = self.task
+    def _started(self, state: Any, constants: Any, drawn: Any) -> StepState:
+        """The start of an episode. What is not given is drawn. Raises a ValueError if it is out of range."""
+        task, params, noise = self.task, self.params, self.randomization
+        z = tuple(self.np_random.random(self._start_draws).tolist())
+        c = None
+        if constants is not None:
+            if isinstance(constants, dict):
+                check_constant_names(task, constants)
+                own = task.draw_constants(z[: task.constant_draws], params)
+                constants = [constants.get(name, value) for name, value in zip(task.constant_names, own, strict=True)]
+            given = finite_array(constants, (len(task.constant_names),), "constants")
+            task.check_constants(given, params)
+            c = _floats(given)
+        x = None if state is None else _floats(finite_array(state, (params.state_size,), "state"))
+        if drawn is not None:
+            drawn = _floats(finite_array(drawn, (noise.episode_draws,), "drawn"))
+        begun = start(task, params, noise, z, self._senses, x, c, drawn)
+        x, c = _floats(begun.x), _floats(begun.c)
+        begun = StepState(x, c, 0, *begun[3:])
         if violated := task.violated(x, task.at(c, 0.0)):
-            values = [f"{quantity.name} = {value:g}" for quantity, value in zip(self.params.STATE, x, strict=True)]
-            measured = zip(self.params.MEASUREMENTS, self.params.measurements(x), strict=True)
+            values = [f"{quantity.name} = {value:g}" for quantity, value in zip(params.STATE, x, strict=True)]
+            measured = zip(params.MEASUREMENTS, params.measurements(x), strict=True)
             values += [f"{quantity.name} = {value:g} {quantity.unit}" for quantity, value in measured]
             raise ValueError(
                 f"{task.id}: the start state is out of range: it violates the limit of {violated} ({', '.join(values)})"
             )
-        return None, self.params.measurements(x)
+        return begun
 
-    def _draw(self, state: Any, constants: Any) -> tuple[State, State]:
-        """Initial state and constants. Those that are not given are drawn."""
-        task = self.task
-        draws = self.np_random.random(task.constant_draws + task.state_draws).tolist()
-        c = _floats(task.draw_constants(tuple(draws[: task.constant_draws]), self.params))
-        if constants is not None:
-            if isinstance(constants, dict):
-                check_constant_names(task, constants)
-                constants = [constants.get(name, value) for name, value in zip(task.constant_names, c, strict=True)]
-            given = finite_array(constants, (len(task.constant_names),), "constants")
-            task.check_constants(given, self.params)
-            c = _floats(given)
-        x = _floats(task.start(tuple(draws[task.constant_draws :]), c, self.params))
-        return x if state is None else _floats(finite_array(state, (self.params.state_size,), "state")), c
-
-    def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, ...], bool]:
-        """The force, N, of an action, and whether it was clipped."""
+    def _checked(self, action: Sequence[float] | np.ndarray) -> tuple[float, ...]:
+        """An action as floats. Raises a ValueError if it is none."""
         parts = real_array(action, "action", self._action_shape).tolist()
-        limit = self._force_limit
-        if max(parts) <= 1.0 and min(parts) >= -1.0 and math.isfinite(sum(parts)):  # max and min may pass over a NaN
-            return tuple([limit * part for part in parts]), False
-        if not all(map(math.isfinite, parts)):
+        if not math.isfinite(sum(parts)) and not all(map(math.isfinite, parts)):
             raise ValueError(f"action must be finite, not {parts}")
-        return tuple([limit * min(max(part, -1.0), 1.0) for part in parts]), True
+        return tuple(parts)
 
-    def _observed(self) -> tuple[float, ...]:
-        """(no) observation of the present state, with the sensors' noise."""
-        x, c = self._state, self.task.at(self._constants, self._taken * self.task.control_dt)
-        if self._sensors:
-            return sensors.seen(self._sensors, c)
-        if self._noisy:
-            z = tuple(self.np_random.random(Randomization.NOISE_DRAWS).tolist())
-            x = self.randomization.sensed(x, z, self._drawn, self._taken * self.task.control_dt)
-        return self.task.seen(x, c, self.params)
+    def _with_past(self, own: np.ndarray, tried: tuple[float, ...] | None = None) -> np.ndarray:
+        """An observation, with the past behind it; at the start of an episode nothing was tried."""
+        if not self.history:
+            return own
+        if tried is None:
+            still = np.zeros(self.params.action_size, np.float32)
+            self._past = np.append(own, np.tile(np.append(own, still), self.history))
+        else:
+            old, size = self._past, len(own)
+            action = np.array(tried).clip(-1.0, 1.0).astype(np.float32)
+            self._past = np.concatenate((own, old[:size], action, old[size:]))[: len(old)]
+        return self._past.copy()
 
-    def _shown(
-        self,
-        judge: step_code.Judge | None,
-        did: State,
-        survive: float,
-        force: tuple[float, ...],
-        clipped: bool = False,
-        grip: tuple[float, ...] = _NO_GRIP,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Observation and `info` of what a step did, an `Outcome` and measurements; who judged it, unless Python did."""
-        seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
-        if self._remembers:
-            own, old = len(seen), self._past
-            if self._taken:
-                self._past = np.concatenate((seen, old[:own], self._tried, old[own:]))[: len(old)]
-            else:
-                still = np.zeros(self.params.action_size, np.float32)
-                self._past = np.append(seen, np.tile(np.append(seen, still), self.history))
-            seen = self._past.copy()
-        cost, running, goal, _, _, succeeded, failed, violated, *measured = did
+    def _info(self, made: Step, measured: State, x: np.ndarray, force: np.ndarray) -> dict[str, Any]:
+        """`info` of a step, with what is measured, the state and the force."""
+        _, survive, running, goal, cost, _, _, succeeded, failed, violated = made.outcome
         success = succeeded > 0
         info = {
-            "state": np.array(self._state) if judge is None else judge.x.copy(),
+            "state": x,
             "cost": cost,
             "reward_survive": survive,
-            "reward_cost": -running,
+            "reward_cost": running,
             "reward_goal": goal,
-            **self.params.named_measurements(measured),
+            **dict(zip(self._measured, measured, strict=True)),
             "success": success,
             "is_success": success,
             "failure": failed > 0,
             "violated": int(violated),
             "constraint_cost": failed,
-            "force": np.array(force) if judge is None else judge.force.copy(),
-            "clipped": clipped,
-            "constants": self._constants_array.copy(),
+            "force": force,
+            "clipped": made.clipped > 0,
+            "constants": self._constants.copy(),
         }
-        if self._grips:
-            info["grip"] = np.array(grip)
+        if made.grip:
+            info["grip"] = np.array(made.grip)
         if self._varies:
-            info["drawn"] = np.array(self._drawn)
-        return seen, info
+            info["drawn"] = np.array(made.state.drawn)
+        return info
 
 
 def make_task(task: str | Task, robot: str | Robot = PAPER, /, **task_fields: Any) -> Task:
@@ -590,3 +560,9 @@ def robot_of(task: str | Task, robot: Any = PAPER, params: Any = None) -> Robot:
 
 def _floats(vector: Sequence[Any] | np.ndarray) -> State:
     return tuple(map(float, vector))
+
+
+def _split(rng: np.random.Generator, like: Draws) -> Draws:
+    """As many uniform numbers as there are."""
+    z = iter(rng.random(sum(map(len, like))).tolist())
+    return Draws._make(tuple(islice(z, len(part))) for part in like)

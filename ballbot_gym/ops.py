@@ -1,4 +1,4 @@
-"""Elementary functions for robot and tasks, which then work with floats, NumPy, CasADi and torch alike, and with `traced`.
+"""Elementary functions for robot and tasks, which then work with floats, NumPy, CasADi and torch alike.
 
 A vector is an array whose last axis holds the components (NumPy, torch), a column (CasADi), or a tuple of components.
 A tuple's components may be floats, arrays of one shape, tensors or symbols. This layout is fast both for one robot in pure
@@ -17,25 +17,27 @@ Vector = Any
 """A tuple of components, an ndarray or tensor (..., n), or a CasADi column (n,)."""
 
 
+_NUMBERS = (float, int)  # a tuple, because a union would be made in every call
+
+
 def _library(a: Any) -> ModuleType:
     """The library of `a`. It is already imported, because `a` exists."""
-    module = type(a).__module__
-    return sys.modules.get(module if module == "ballbot_gym.machine_code.traced" else module.partition(".")[0], np)
+    return sys.modules.get(type(a).__module__.partition(".")[0], np)
 
 
 def sin(a: Any) -> Any:
     """Sine, elementwise."""
-    return math.sin(a) if isinstance(a, float | int) else _library(a).sin(a)
+    return math.sin(a) if isinstance(a, _NUMBERS) else _library(a).sin(a)
 
 
 def cos(a: Any) -> Any:
     """Cosine, elementwise."""
-    return math.cos(a) if isinstance(a, float | int) else _library(a).cos(a)
+    return math.cos(a) if isinstance(a, _NUMBERS) else _library(a).cos(a)
 
 
 def sqrt(a: Any) -> Any:
     """Square root, elementwise."""
-    return math.sqrt(a) if isinstance(a, float | int) else _library(a).sqrt(a)
+    return math.sqrt(a) if isinstance(a, _NUMBERS) else _library(a).sqrt(a)
 
 
 def exp(a: Any) -> Any:
@@ -50,12 +52,12 @@ def log(a: Any) -> Any:
 
 def arccos(a: Any) -> Any:
     """Arc cosine, elementwise."""
-    return math.acos(a) if isinstance(a, float | int) else _library(a).arccos(a)
+    return math.acos(a) if isinstance(a, _NUMBERS) else _library(a).arccos(a)
 
 
 def arctan(a: Any) -> Any:
     """Arc tangent, elementwise."""
-    return math.atan(a) if isinstance(a, float | int) else _library(a).arctan(a)
+    return math.atan(a) if isinstance(a, _NUMBERS) else _library(a).arctan(a)
 
 
 def floor(a: Any) -> Any:
@@ -65,7 +67,7 @@ def floor(a: Any) -> Any:
 
 def clip(a: Any, low: Any, high: Any) -> Any:
     """The nearest number in [low, high], elementwise; NaN stays NaN, but not with CasADi."""
-    if isinstance(a, float | int):
+    if isinstance(a, _NUMBERS):
         return max(min(a, high), low)
     library = _library(a)
     return library.fmax(library.fmin(a, high), low) if _is_casadi(a) else library.clip(a, low, high)
@@ -82,7 +84,7 @@ def maximum(a: Any, b: Any) -> Any:
 
 
 def _least_or_greatest(name: str, of_symbols: str, of_floats: Any, a: Any, b: Any) -> Any:
-    if isinstance(a, float | int) and isinstance(b, float | int):
+    if isinstance(a, _NUMBERS) and isinstance(b, _NUMBERS):
         return of_floats(a, b)
     return getattr(_library(a), of_symbols if _is_casadi(a) else name)(a, b)
 

@@ -1,6 +1,6 @@
-"""What a control step costs, pays and ends: the one place that says so, for an env, for batches and for generated code.
+"""A control step, and what is observed after it: one pure function each, for an env, for batches and for generated code.
 
-It computes with `ops`, so with floats, torch, CasADi and `traced` alike. Truth values are the numbers 1 and 0, because only
+They compute with `ops`, so with floats, NumPy, torch and CasADi alike. Truth values are the numbers 1 and 0, because only
 these are the same everywhere.
 """
 
@@ -12,13 +12,13 @@ from gymnasium import spaces
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.robot import Randomization, Robot
+from ballbot_gym.robot import Randomization, Robot, needed_friction, sensors
 from ballbot_gym.tasks.base import Task
 
 _LARGEST_OBSERVED = 1e6  # far beyond what any episode shows
 
 GRIP = "grip"
-"""The limit that a robot violates that loses its grip."""
+"""Name of the limit that is violated when the ball loses grip."""
 ENGINE = "engine"
 """The limit that is violated where an engine's simulation is unstable, so that no state follows."""
 
@@ -29,15 +29,18 @@ def limit_names(task: Task, params: Robot) -> tuple[str, ...]:
 
 
 class Outcome(NamedTuple):
-    """What one control step did."""
+    """What one control step costs, pays and ends."""
 
+    reward: Any
+    """The sum of the three parts that follow."""
+    reward_survive: Any
+    """survival_reward · control_dt."""
+    reward_cost: Any
+    """−cost rate · control_dt."""
+    reward_goal: Any
+    """Pay for the time that remains, where the goal ends the episode."""
     cost: Any
     """The running cost, and for a failure the price of the time that remains."""
-    running: Any
-    """The running cost alone."""
-    goal: Any
-    """Pay for the time that remains, where the goal ends the episode. The reward is survive − running + goal, with survive =
-    survival_reward · control_dt."""
     terminated: Any
     truncated: Any
     success: Any
@@ -49,7 +52,7 @@ class Outcome(NamedTuple):
 def outcome(
     task: Task, before: Vector, force: Vector, end: Vector, c: Vector, steps: Any, grip: tuple[Any, ...] = ()
 ) -> Outcome:
-    """What a control step did.
+    """What a control step costs, pays and ends.
 
     Args:
         task: the task.
@@ -73,10 +76,16 @@ def outcome(
     failed = ops.where(failure, ops.full_like(violated, 1.0), 0.0)
     terminated = failed + success if task.first_exit else failed
     ahead = task.survival_reward * task.control_dt * (task.steps - steps)  # pay for the time that remains
+    survive, goal = (
+        task.survival_reward * task.control_dt,
+        ops.where(success > 0, ahead, 0.0) if task.first_exit else 0.0,
+    )
     return Outcome(
+        reward=survive - running + goal,
+        reward_survive=survive,
+        reward_cost=-running,
+        reward_goal=goal,
         cost=running + ops.where(failure, ahead, 0.0),
-        running=running,
-        goal=ops.where(success > 0, ahead, 0.0) if task.first_exit else 0.0,
         terminated=terminated,
         truncated=ops.where(last, 1.0 - terminated, 0.0),
         success=success,
@@ -85,50 +94,105 @@ def outcome(
     )
 
 
+class StepState(NamedTuple):
+    """What determines how an environment continues, except for random numbers."""
+
+    x: tuple[Any, ...]
+    """The robot's state."""
+    c: tuple[Any, ...]
+    """Constants of the episode, without the time."""
+    steps: Any
+    """Control steps taken in the episode."""
+    drawn: tuple[Any, ...] = ()
+    """What the randomization drew for the episode; () where nothing varies."""
+    actuator: tuple[Any, ...] = ()
+    """What the actuator remembers; see `Randomization.actuate`."""
+    sensors: tuple[Any, ...] = ()
+    """What sensors remember, where they are what is observed; see `sensors.MEMORY`."""
+
+
+class Draws(NamedTuple):
+    """Uniform numbers in [0, 1) of a control step; () of what does not vary."""
+
+    push: tuple[Any, ...] = ()
+    sensors: tuple[Any, ...] = ()
+    noise: tuple[Any, ...] = ()
+    """Of the observation after the step."""
+
+
 class Step(NamedTuple):
     """One control step of a robot, as far as it does not start another episode."""
 
-    end: tuple[Any, ...]
+    state: StepState
     """The state after it."""
+    outcome: Outcome
     force: tuple[Any, ...]
-    """What the actuators apply, as `Robot.ACTION` names it."""
-    total: tuple[Any, ...]
-    """The same with pushes."""
-    actuator: tuple[Any, ...]
-    """What the actuators remember."""
+    """What the actuators applied, as `Robot.ACTION` names it."""
     clipped: Any
     """Whether a component of the action was outside [−1, 1]."""
     grip: tuple[Any, ...]
     """What `info` reports as "grip"; () of a robot that cannot lose its grip."""
-    reward: Any
-    outcome: Outcome
 
 
 Move = Callable[[Any, tuple[Any, ...], tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]]
 """Robot, state and what is applied -> the state after a control step, and what `Robot.held` gives."""
 
 
-def closed_form(dt: float) -> Move:
-    """How a robot moves over control steps of dt, s, by its equations of motion."""
+def closed_form(dt: float, substeps: int | None = None) -> Move:
+    """How a robot moves over control steps of dt, s, by its equations of motion, in `Robot.substeps` by default."""
 
     def move(robot: Any, x: tuple[Any, ...], u: tuple[Any, ...]) -> tuple[tuple[Any, ...], ...]:
-        return robot.step(x, u, dt, robot.substeps(dt)), *robot.held(x, u, dt)
+        return robot.step(x, u, dt, substeps or robot.substeps(dt)), *robot.held(x, u, dt)
 
     return move  # pyright: ignore[reportReturnType]
+
+
+def by_engine(end: tuple[Any, ...], floor: tuple[Any, ...], stable: Any, dt: float) -> Move:
+    """How a robot moved that an engine simulates.
+
+    Args:
+        end: the state after the control step.
+        floor: the floor's force on the ball at its end, (f_x, f_y, N) in N; () where the engine does not simulate it.
+        stable: ≥ 0 unless the simulation became unstable.
+        dt: duration of the step, s.
+    """
+
+    def move(robot: Any, x: tuple[Any, ...], u: tuple[Any, ...]) -> tuple[tuple[Any, ...], ...]:
+        # a ball that slips in a simulation is no failure
+        grip, kept = ((*floor, needed_friction(floor)), (0.0,)) if floor else robot.held(x, u, dt)  # pyright: ignore
+        return end, grip, (*kept, stable)
+
+    return move  # pyright: ignore[reportReturnType]
+
+
+def applied(
+    robot: Any, variation: Randomization, state: StepState, action: tuple[Any, ...], push: tuple[Any, ...], dt: float
+) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
+    """What acts on the robot during a control step of dt, s. The other arguments are those of `step`.
+
+    Returns:
+        what the actuators apply, as `Robot.ACTION` names it; the same with pushes; and what the actuators remember.
+    """
+    limit = robot.force_limit
+    force = tuple([ops.clip(part, -1.0, 1.0) * limit for part in action])
+    actuator = state.actuator
+    if actuator:
+        force, actuator = variation.actuate(force, state.drawn, actuator)
+    if not push:
+        return force, force, actuator
+    total = tuple([f + pushed for f, pushed in zip(force, variation.push(push, dt), strict=True)])
+    return force, total, actuator
 
 
 def step(
     task: Task,
     robot: Any,
-    x: tuple[Any, ...],
-    c: tuple[Any, ...],
-    taken: Any,
+    variation: Randomization,
+    state: StepState,
     action: tuple[Any, ...],
-    variation: Randomization = Randomization(),
-    drawn: tuple[Any, ...] = (),
-    actuator: tuple[Any, ...] = (),
-    z: tuple[Any, ...] = (),
+    z: Draws = Draws(),
     move: Move | None = None,
+    model: Any = None,
 ) -> Step:
     """One control step: what the actuators apply, where it takes the robot, and what it costs, pays and ends.
 
@@ -137,28 +201,87 @@ def step(
     Args:
         task: the task.
         robot: the nominal robot.
-        x: the state.
-        c: the constants of the episode, without the time.
-        taken: control steps of the episode before this one.
+        variation: what varies.
+        state: before the step.
         action: in units of the robot's force limit; clipped to [−1, 1].
-        variation: what varies, and what it drew for the episode.
-        actuator: what the actuators remember.
-        z: uniform numbers for a push; () where none comes.
+        z: uniform numbers for a push and for sensors.
         move: how the robot moves; default, the closed form.
+        model: the robot of the episode; default, as the variation drew it.
     """
-    commanded = tuple([ops.clip(part, -1.0, 1.0) * robot.force_limit for part in action])
-    force, actuator = variation.actuate(commanded, drawn, actuator)
-    total = force
-    if z:
-        total = tuple([f + push for f, push in zip(force, variation.push(z, task.control_dt), strict=True)])
-    model = variation.robot(robot, drawn) if variation.varies_robot else robot
-    end, grip, kept = (move or closed_form(task.control_dt))(model, x, total)
-    did = outcome(task, x, force, end, c, taken + 1, kept)
+    if model is None:
+        model = variation.robot(robot, state.drawn) if variation.varies_robot else robot
+    force, total, actuator = applied(robot, variation, state, action, z.push, task.control_dt)
+    end, grip, kept = (move or closed_form(task.control_dt))(model, state.x, total)
+    did = outcome(task, state.x, force, end, state.c, state.steps + 1, kept)
+    read = state.sensors
+    if read:
+        read = sensors.following(model, read, state.x, total, end, z.sensors, task.control_dt)
     largest = action[0] * action[0]
     for part in action[1:]:
         largest = ops.maximum(largest, part * part)
-    reward = task.survival_reward * task.control_dt - did.running + did.goal
-    return Step(end, force, total, actuator, largest > 1.0, grip, reward, did)
+    after = state._replace(x=end, steps=state.steps + 1, actuator=actuator, sensors=read)
+    return Step(after, did, force, largest > 1.0, grip)
+
+
+def start_draws(task: Task, variation: Randomization, senses: bool) -> int:
+    """Uniform numbers that `start` takes."""
+    varied = variation.episode_draws * variation.active
+    return task.constant_draws + task.state_draws + varied + sensors.FIRST_DRAWS * senses
+
+
+def start(
+    task: Task,
+    robot: Any,
+    variation: Randomization,
+    z: tuple[Any, ...],
+    senses: bool = False,
+    x: tuple[Any, ...] | None = None,
+    c: tuple[Any, ...] | None = None,
+    drawn: tuple[Any, ...] | None = None,
+) -> StepState:
+    """The start of an episode.
+
+    Args:
+        task: the task.
+        robot: the nominal robot.
+        variation: what varies.
+        z: `start_draws` uniform numbers.
+        senses: whether sensors are observed, and not the state.
+        x, c, drawn: state, constants and draws of the variation; drawn where they are not given.
+    """
+    z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
+    if c is None:
+        c = tuple(task.draw_constants(z_constants, robot))
+    if x is None:
+        x = tuple(task.start(z[: task.state_draws], c, robot))
+    if drawn is None:
+        own = z[task.state_draws :][: variation.episode_draws]
+        drawn = variation.draw(own, task.control_dt) if variation.varies_episodes else ()
+    zero = ops.full_like(x[0], 0.0)
+    actuator = variation.resting((zero,) * robot.action_size, task.control_dt)
+    read = ()
+    if senses:
+        model = variation.robot(robot, drawn) if variation.varies_robot else robot
+        read = sensors.first(model, x, z[-sensors.FIRST_DRAWS :], task.control_dt)
+    return StepState(x, c, zero, drawn, actuator, read)
+
+
+def observe(task: Task, robot: Any, variation: Randomization, state: StepState, noise: Any = ()) -> tuple[Any, ...]:
+    """What is observed in a state, with the errors of sensors.
+
+    Args:
+        task: the task.
+        robot: the nominal robot.
+        variation: what varies.
+        state: the state.
+        noise: uniform numbers, where the variation is noisy.
+    """
+    time = state.steps * task.control_dt
+    c = task.at(state.c, time)
+    if state.sensors:
+        return sensors.seen(state.sensors, c)
+    x = variation.sensed(state.x, noise, state.drawn, time) if variation.is_noisy else state.x
+    return ops.components(task.seen(x, c, robot))
 
 
 def first_violated(limits: tuple[Any, ...]) -> Any:
@@ -182,8 +305,11 @@ def check_observation(observation: Any, params: Robot, randomization: Randomizat
     return observation
 
 
-def _observation_size(task: Task, params: Robot, observation: str) -> int:
-    """Numbers that are observed. Sensors show 9 readings, x and y where the episode began, m, and the task's constants."""
+def observation_size(task: Task, params: Robot | type[Robot], observation: str) -> int:
+    """Numbers that a robot or a kind of robot observes.
+
+    Sensors show 9 readings, x and y where the episode began, m, and the task's constants.
+    """
     if observation == "state":
         return task.observation_size(params)
     return 11 + len(task.constant_names) + task.clock
@@ -194,7 +320,7 @@ def observation_space(task: Task, params: Robot, history: int = 0, observation: 
 
     Past actions lie in [−1, 1]. So the bounds tell this space from a stack of frames that has the same size.
     """
-    own = _observation_size(task, params, observation)
+    own = observation_size(task, params, observation)
     past = np.append(np.full(own, _LARGEST_OBSERVED), np.ones(params.action_size))
     high = np.append(np.full(own, _LARGEST_OBSERVED), np.tile(past, history)).astype(np.float32)
     return spaces.Box(-high, high, dtype=np.float32)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
 from ballbot_gym import BallbotEnv, BallbotVectorEnv, machine_code, rollout
+from ballbot_gym.engines import installed_physics
 from ballbot_gym.env import make_task
 from ballbot_gym.machine_code import codegen
 from ballbot_gym.robot import PAPER, ROBOTS
@@ -67,9 +68,8 @@ def recorded() -> Iterator[list[Code]]:
 def environments(task: str, robot: str) -> None:
     """Runs a single environment and vector environments, those of the paper's robot in both precisions."""
     env = BallbotEnv(task, physics="rk4", robot=robot)
-    for seed in range(2):  # machine code comes with the second episode
-        env.reset(seed=seed)
-        env.step(np.zeros(env.params.action_size))
+    env.reset(seed=0)
+    env.step(np.zeros(env.params.action_size))
     for dtype in ("float32", "float64") if robot == PAPER else ("float32",):
         envs = BallbotVectorEnv(2, task, robot=robot, dtype=dtype, engine="native")
         envs.reset(seed=0)
@@ -117,12 +117,16 @@ def write(codes: Iterator[Code], folder: Path) -> None:
 
 
 def write_sources(folder: Path) -> None:
-    """Writes the code of vector environments under the names by which they find it where CasADi is missing."""
+    """Writes the code of environments under the names by which they find it where CasADi is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     for robot, task, double in itertools.product(ROBOTS, TASKS, (False, True)):
         made, params = make_task(task, robot), ROBOTS[robot].params
         source = codegen.source(made, params, double)
         (folder / f"{native.code_name(made, params, double)}.c").write_text(source, encoding="utf-8")
+    for robot, task, physics in itertools.product(ROBOTS, TASKS, installed_physics()):
+        params = ROBOTS[robot].params
+        problem = BallbotEnv(task, physics, robot=robot).step_problem
+        (folder / f"{problem.code_name(params)}.c").write_text(codegen.single_source(problem), encoding="utf-8")
 
 
 def read(folder: Path) -> list[Code]:

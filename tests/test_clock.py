@@ -7,7 +7,6 @@ from test_examples import load
 
 from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optima, find_optimum, regret
 from ballbot_gym import BallbotEnv
-from ballbot_gym.machine_code import step_code
 from ballbot_gym.rollout import rollout
 from ballbot_gym.step import outcome
 from ballbot_gym.vector.batch import BallbotBatch
@@ -66,18 +65,6 @@ def test_a_step_costs_what_it_costs_at_its_beginning_and_is_judged_at_its_end(ta
     assert did.cost == dt * task.cost(x, u, (*c, (task.steps - 1) * dt))
     assert did.success == task.is_goal(x, (*c, task.duration))
     assert task.observe(x, (*c, 0.0)) != task.observe(x, (*c, 1.0))
-
-
-def test_machine_code_of_a_single_env_computes_the_bits_of_python(task, params):
-    judge = step_code.judge(task, params)
-    assert judge is not None
-    x, c = task.sample(np.random.default_rng(1), params)
-    x, c, u, steps = tuple(x.tolist()), tuple(c.tolist()), (3.0, -2.0), 40
-    judge.c[:] = c
-    did = judge.judge(x, u, x, steps, 0.0)
-    assert did is not None
-    assert did[:-1] == outcome(task, x, u, x, c, steps, (0.0,))
-    np.testing.assert_array_equal(judge.seen, task.observe(x, (*c, steps * task.control_dt)))
 
 
 def test_the_optimum_repeats_in_the_env_at_its_cost_and_controllers_come_near_it(task, params):

@@ -246,12 +246,12 @@ def test_every_operation_that_is_known_as_c_does_what_casadis_does(tmp_path, mon
         less, a <= b, same, a != b, casadi.logic_not(less), casadi.logic_not(a), casadi.logic_and(less, a > 0),
         casadi.logic_or(less, same), casadi.logic_and(a, b), casadi.if_else(less, a, b), casadi.if_else(a, b, 3.0),
         casadi.if_else(less, a, np.inf), casadi.if_else(same, -np.inf, casadi.if_else(less, 1.0, 0.0)),
+        casadi.floor(3 * a), casadi.fabs(a) ** b, casadi.fabs(a) ** 1.5,
     ]  # fmt: skip
     block = codegen.block("every", [("a", [a]), ("b", [b])], [("y", values)])
     head = f"#define LANES {codegen.LANES}\n#include <math.h>\n#include <stdint.h>\ntypedef double real;\n"
-    head += "".join(
-        f"#define real_{name} {name}\n" for name in ("sqrt", "fabs", "sin", "cos", "tan", "atan", "acos", "exp", "log")
-    )
+    names = ("sqrt", "fabs", "floor", "sin", "cos", "tan", "atan", "acos", "exp", "log", "pow")
+    head += "".join(f"#define real_{name} {name}\n" for name in names)
     whole = "void whole(double *a, double *b, double *y) { every(a, LANES, b, LANES, y, LANES); }\n"
     monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
     library = ctypes.CDLL(str(machine_code.library("every", head + block + whole, native._COMPILER_FLAGS)))

@@ -1,15 +1,11 @@
 """Optima of any problem in the user's cache folder: a folder per problem, a file per episode.
 
-The folder's name holds a digest of all that an optimum depends on: the task's formulas, fields, draws and guesses, the
-robot, and the solver's version. Formulas are traced operation by operation. So a change anywhere behind `cost` makes another
-problem, and a comment does not. Where they cannot be traced, the source of the class is taken.
+The folder's name holds a digest of all that an optimum depends on: what the task computes, its fields, draws and guesses, the
+robot, and the solver's version. What a task computes is compared at fixed states; see `tasks.identity`. So a change anywhere
+behind `cost` makes another problem, and a comment does not.
 """
 
-import hashlib
-import inspect
-import json
 import os
-import uuid
 import zlib
 from collections.abc import Iterator
 from functools import lru_cache
@@ -20,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import machine_code
-from ballbot_gym.machine_code import traced
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import digest, problem_parts
 
 _MOST_DRAWS = 20
 
@@ -79,21 +75,18 @@ def path(task: Task, params: Robot, index: int, randomization: Randomization = R
 @lru_cache(maxsize=64)
 def _digest(task: Task, params: Robot, randomization: Randomization) -> str:
     """Of all that an optimum depends on, as 24 hexadecimal digits."""
-    varied = [repr(randomization)] if randomization.moves_optima else []
-    parts = [
-        task.id,
-        task.problem(),
-        params.record(),
-        *map(_version, ("ballbot-gym", "casadi")),
-        _formulas(task, params),
-    ]
-    parts += varied
+    computed = problem_parts(task, params)
+    parts: list[Any] = [task.id, task.problem(), *map(_version, ("ballbot-gym", "casadi"))]
+    parts += [computed[name] for name in ("robot", "episodes", "costs", "limits", "goal")]
+    parts += [repr(randomization)] if randomization.moves_optima else []
     for index in range(2):
         x, c = episode(task, params, index)
+        dt, force = task.control_dt, np.full(params.action_size, 0.1 * params.force_limit)
+        parts.append(np.round(params.step(x, force, dt, params.substeps(dt)), 9).tolist())
         paths = [np.round(path, 9).tolist() for path in task.guess_paths(x, c, params)]
         guesses = [] if paths else [np.round(states, 9).tolist() for states, _ in task.guesses(x, c, params)]
-        parts.append(json.dumps([x.tolist(), c.tolist(), paths, *guesses]))
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+        parts.append([x.tolist(), c.tolist(), paths, *guesses])
+    return digest(*parts)
 
 
 def _version(package: str) -> str:
@@ -101,24 +94,3 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return ""
-
-
-def _formulas(task: Task, params: Robot) -> str:
-    """What the task and the robot compute, as text."""
-
-    def compute(x: tuple, u: tuple, c: tuple, z_constants: tuple, z_state: tuple) -> tuple[Any, ...]:
-        drawn = (*task.draw_constants(z_constants, params), *task.draw_state(z_state, c[:constants], params))
-        moved = params.step(x, u, task.control_dt, params.substeps(task.control_dt))
-        return (task.cost(x, u, c), *task.margins(x, c), *task.goal(x, c), *drawn, *moved)
-
-    constants = len(task.constant_names)
-    counts = (params.state_size, params.action_size, constants + task.clock, task.constant_draws, task.state_draws)
-    try:
-        return traced.function("problem", compute, counts)
-    except Exception:  # users' code may raise any error when it gets a traced number
-        kinds = [kind for kind in type(task).__mro__ if issubclass(kind, Task) and kind is not Task]
-        try:
-            return "".join(map(inspect.getsource, kinds))
-        except (OSError, TypeError):
-            # changes of a task without source code go unnoticed, so its optima are kept for this process alone
-            return uuid.uuid4().hex

@@ -1,6 +1,6 @@
 """Machine code: C code of what tasks and robots compute, and how it becomes shared libraries.
 
-`codegen` writes C for many robots at once, `traced` and `step_code` for a single one, and `libraries` compiles it.
+`codegen` prints C, for many robots at once and for one, `single` runs that of one, and `libraries` compiles it.
 """
 
 from ballbot_gym.machine_code.libraries import (

@@ -13,8 +13,9 @@ from typing import Any
 
 from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import Robot
-from ballbot_gym.step import step
+from ballbot_gym.machine_code.single import StepProblem
+from ballbot_gym.robot import Randomization, Robot
+from ballbot_gym.step import StepState, step
 from ballbot_gym.tasks import Task
 
 with imports_of("the machine code of batches", "baselines"):
@@ -48,6 +49,9 @@ OPERATIONS = {
     casadi.OP_EXP: "real_exp({0})",
     casadi.OP_LOG: "real_log({0})",
     casadi.OP_FABS: "real_fabs({0})",
+    casadi.OP_FLOOR: "real_floor({0})",
+    casadi.OP_POW: "real_pow({0}, {1})",
+    casadi.OP_CONSTPOW: "real_pow({0}, {1})",
     casadi.OP_FMIN: "{0} < {1} ? {0} : {1}",
     casadi.OP_FMAX: "{0} > {1} ? {0} : {1}",
     casadi.OP_LT: "{0} < {1} ? (real)1 : (real)0",
@@ -114,6 +118,36 @@ def source(task: Task, params: Robot, double: bool) -> str:
     return "\n".join([*defined, text("real.h"), text("native.c"), *blocks])
 
 
+def single_source(problem: StepProblem) -> str:
+    """The C code `void compute(double *numbers)` of a step of one environment.
+
+    The numbers are the problem's results, then the arguments of the step, then those of the episode.
+
+    Raises:
+        Exception: as `source`.
+    """
+    given = {name: _symbols(f"{name}_", size) for name, size in (problem.of_step() | problem.of_episode()).items()}
+    results = problem.computed(given)
+    count, arguments, at = len(results), [], 0
+    for part in (*results.values(), *given.values()):
+        arguments.append(f"numbers + {at}, 1")
+        at += len(part)
+    code = block(
+        "one",
+        [(f"given_{name}", part) for name, part in given.items()],
+        [(f"made_{name}", part) for name, part in results.items()],
+    )
+    called = ", ".join((*arguments[count:], *arguments[:count]))
+    return "\n".join(
+        [
+            "#define DOUBLE 1\n#define LANES 1",
+            text("real.h"),
+            code,
+            f"void compute(double *numbers) {{\n    one({called});\n}}\n",
+        ]
+    )
+
+
 _TRANSPOSE = """
 static void gather(int rows, const double *columns, real *out) {
     for (int k = 0; k < LANES; ++k)
@@ -176,13 +210,13 @@ def _advance(
     task: Task, params: Robot, x: tuple, c: tuple, action: tuple, taken: Any
 ) -> tuple[tuple[str, Sequence[Any]], ...]:
     """One control step, up to the start of the next episode."""
-    did = step(task, params, x, c, taken, action)
+    did = step(task, params, Randomization(), StepState(x, c, taken), action)
     end = did.outcome
     return (
-        ("end", did.end),
+        ("end", did.state.x),
         ("force", did.force),
         ("grip", did.grip),
-        ("pay", (did.reward, end.cost)),
+        ("pay", (end.reward, end.cost)),
         ("flags", (end.terminated, end.truncated, end.success, end.failure, did.clipped)),
         ("violated", (end.violated,)),
     )

@@ -7,11 +7,13 @@
 typedef double real;
 #define real_sqrt sqrt
 #define real_fabs fabs
+#define real_floor floor
 #define SUFFIX ""
 #else
 typedef float real;
 #define real_sqrt sqrtf
 #define real_fabs fabsf
+#define real_floor floorf
 #define SUFFIX "f"
 #endif
 
@@ -37,3 +39,4 @@ SIMD real real_atan(real) NAME("atan");
 SIMD real real_acos(real) NAME("acos");
 SIMD real real_exp(real) NAME("exp");
 SIMD real real_log(real) NAME("log");
+SIMD real real_pow(real, real) NAME("pow");

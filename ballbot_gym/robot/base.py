@@ -87,8 +87,9 @@ class Robot(ABC):
     """Whether the action is the horizontal force on the robot, to which a push adds."""
     TRACK_FILTERS: ClassVar[bool] = False
     """Whether filters estimate what `TRACKS` hide of this kind of robot."""
-    SENSORS: ClassVar[bool] = False
-    """Whether `observation="sensors"` is modelled; see `ballbot_gym.robot.sensors`."""
+    SENSORS: ClassVar[tuple[str, ...]] = ()
+    """Numbers that sensors read, besides `number_names`; () where `observation="sensors"` is not modelled. See
+    `ballbot_gym.robot.sensors`."""
 
     PARTS: ClassVar[dict[str, type]] = {}
     """Classes of the fields that hold several numbers each."""
@@ -135,7 +136,7 @@ class Robot(ABC):
 
     def named_measurements(self, values: Iterable[Any]) -> dict[str, Any]:
         """Measurements by name."""
-        return dict(zip((each.name for each in self.MEASUREMENTS), values, strict=True))
+        return {each.name: value for each, value in zip(self.MEASUREMENTS, values, strict=True)}
 
     def limits(self, x: Vector, u: Vector, backoff: Any = 0.0, hold: Any = None) -> tuple[Any, ...]:
         """The robot's own limits, each ≥ 0 where it holds, while u is applied in state x, and held for `hold` seconds."""

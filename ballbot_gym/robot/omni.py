@@ -125,7 +125,7 @@ class Omni(RollingBall):
     LONG_EQUATIONS = True
     BATCHED_OPTIMA = False
     PUSHABLE = False
-    SENSORS = True
+    SENSORS = ("com_height",)
     TRACK_FILTERS = False
     FORCE_SHARE = math.sqrt(3) * _COS  # of the three wheels together, at standstill
 

@@ -6,6 +6,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 from ballbot_gym import ops
@@ -102,61 +103,61 @@ class Randomization:
         if self.push_interval == 0:
             raise ValueError("Randomization: push_interval must be positive, not 0")
 
-    @property
+    @cached_property
     def varies_robot(self) -> bool:
         """Whether robots differ from the nominal one."""
         return any(r != (1.0, 1.0) for r in self._factors)
 
-    @property
+    @cached_property
     def varies_actuator(self) -> bool:
         """Whether the force lags, is delayed, or differs from the command."""
         return self.actuator_lag[1] > 0 or self.actuator_delay[1] > 0 or self.force != (1.0, 1.0)
 
-    @property
+    @cached_property
     def is_noisy(self) -> bool:
         """Whether observations have errors."""
         return any(self.noise) or self.is_biased
 
-    @property
+    @cached_property
     def is_biased(self) -> bool:
         """Whether sensors have errors that stay for an episode."""
         return any(self._biases)
 
-    @property
+    @cached_property
     def varies_episodes(self) -> bool:
         """Whether `draw` draws anything."""
         return self.varies_robot or self.varies_actuator or self.is_biased
 
-    @property
+    @cached_property
     def moves_optima(self) -> bool:
         """Whether an episode's optimum differs from that of the nominal robot with an ideal actuator."""
         return self.varies_robot or self.varies_actuator
 
-    @property
+    @cached_property
     def episode_draws(self) -> int:
         """Uniform numbers that `draw` takes."""
         every = self.is_biased or self.force != (1.0, 1.0) or self.friction != (1.0, 1.0)
         return len(self.DRAWN) if every else 6
 
-    @property
+    @cached_property
     def _factors(self) -> tuple[Range, ...]:
         return self.body_mass, self.ball_mass, self.com_height, self.inertia, self.force, self.friction
 
-    @property
+    @cached_property
     def _biases(self) -> tuple[float, ...]:
         return self.odometry_drift, self.lean_bias, self.lean_rate_bias
 
-    @property
+    @cached_property
     def pushes(self) -> bool:
         """Whether pushes come."""
         return self.push_impulse[1] > 0
 
-    @property
+    @cached_property
     def active(self) -> bool:
         """Whether anything varies."""
         return self.varies_robot or self.varies_actuator or self.is_noisy or self.pushes
 
-    @property
+    @cached_property
     def noise(self) -> tuple[float, ...]:
         """Standard deviation of each observed state component, in its unit; order as in `Ballbot.STATE`."""
         groups = (self.position_noise, self.lean_noise, self.velocity_noise, self.lean_rate_noise)

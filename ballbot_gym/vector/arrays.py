@@ -11,7 +11,7 @@ import numpy as np
 
 from ballbot_gym import ops, seeding
 from ballbot_gym.robot import Robot
-from ballbot_gym.step import step
+from ballbot_gym.step import StepState, step
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.native import FLAG_ROWS, BallbotNative, Computed, State
 
@@ -61,10 +61,11 @@ class BallbotArrays(BallbotNative):
         """One control step: rows of states, measurements, forces and grip; pay; flags; and violated limits."""
         task, params, size = self.task, self.params, self.num_envs
         x, c, a = tuple(old.x), tuple(old.c), tuple(actions.T)
-        made = step(task, params, x, c, old.steps.astype(self.dtype), a)
-        did, survive = made.outcome, task.survival_reward * task.control_dt
+        made = step(task, params, self.randomization, StepState(x, c, old.steps.astype(self.dtype)), a)
+        did, end = made.outcome, made.state.x
         pay = np.empty((5, size))
-        for row, part in zip(pay, (made.reward, did.cost, survive, -did.running, did.goal), strict=True):
+        parts = did.reward, did.cost, did.reward_survive, did.reward_cost, did.reward_goal
+        for row, part in zip(pay, parts, strict=True):
             row[:] = part
         flags = np.empty((FLAG_ROWS, size), bool)
         for row, part in zip(
@@ -73,7 +74,7 @@ class BallbotArrays(BallbotNative):
             row[:] = np.asarray(part) != 0
         flags[_TRUNCATED] |= ~flags[_TERMINATED] & (old.steps + 1 >= self.most_steps)
         flags[_DONE] = flags[_TERMINATED] | flags[_TRUNCATED]
-        rows = self._rows((*made.end, *params.measurements(made.end), *made.force, *made.grip), size)
+        rows = self._rows((*end, *params.measurements(end), *made.force, *made.grip), size)
         return rows, pay, flags, np.asarray(did.violated, np.int64)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:

@@ -28,7 +28,7 @@ from ballbot_gym.robot import (
     sensors,
 )
 from ballbot_gym.seeding import seeds_of
-from ballbot_gym.step import check_observation, limit_names, step
+from ballbot_gym.step import Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.state import BatchState, _check_starts
 
@@ -306,30 +306,15 @@ class BallbotBatch:
 
     def _transition(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
         """`transition` with flags, 0 and 1, and `violated` as numbers: torch's CPU code generator stores bools one by one."""
-        task, noise = self.task, self.randomization
-        now = _rows(state)
-        x, c = now.x, now.c
+        now, noise, steps = _rows(state), self.randomization, state.steps + 1
         asked = actions.to(self.dtype).unbind(-1)
-        z = ()
-        if noise.pushes:
-            key = seeding.key(state.seed, state.episode, state.steps + 1)
-            z = seeding.uniforms(key, Randomization.PUSH_DRAWS, self.dtype)
-        made = step(
-            task,
-            self.params,
-            x,
-            c,
-            state.steps.to(self.dtype),
-            asked,
-            noise,
-            now.drawn,
-            now.actuator,
-            z,
-            self._moved,
-        )
-        end, did, steps = made.end, made.outcome, state.steps + 1
+        key = seeding.key(state.seed, state.episode, steps)
+        push = seeding.uniforms(key, Randomization.PUSH_DRAWS, self.dtype) if noise.pushes else ()
+        read = seeding.uniforms(key, sensors.DRAWS, self.dtype) if now.sensors else ()
+        made = step(self.task, self.params, noise, self._step_state(now), asked, Draws(push, read), self._moved)
+        end, did = made.state.x, made.outcome
         truncated = did.truncated
-        if self.most_steps < task.steps:
+        if self.most_steps < self.task.steps:
             truncated = torch.where(steps >= self.most_steps, 1.0 - did.terminated, truncated)
         done = did.terminated + truncated > 0
 
@@ -337,11 +322,7 @@ class BallbotBatch:
         if past:
             tried = (part.clamp(-1.0, 1.0) for part in asked)
             past = (*self._seen(now), *tried, *past)[: len(past)]
-        read = now.sensors
-        if read:
-            z = seeding.uniforms(seeding.key(state.seed, state.episode, steps), sensors.DRAWS, self.dtype)
-            read = sensors.following(self.model(now.drawn), read, x, made.total, end, z, task.control_dt)
-        after = now._replace(x=end, steps=steps, actuator=made.actuator, past=past, sensors=read)
+        after = now._replace(x=end, steps=steps, actuator=made.state.actuator, past=past, sensors=made.state.sensors)
         new, observed = after, self._observe(after)
         observation = observed
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
@@ -350,7 +331,7 @@ class BallbotBatch:
             observation = self._observe(new)
         result = BatchStep(
             observation=observation,
-            reward=made.reward,
+            reward=did.reward,
             cost=did.cost,
             terminated=did.terminated,
             truncated=truncated,
@@ -409,25 +390,14 @@ class BallbotBatch:
         drawn: torch.Tensor | None = None,
     ) -> _Rows:
         """The starts of episodes; x, c and what the randomization draws are drawn where they are not given."""
-        task, noise = self.task, self.randomization
-        key = seeding.key(seed, episode, 0 * episode)
-        varied = noise.varies_episodes
-        senses = self.observation == "sensors"
-        count = task.constant_draws + task.state_draws + noise.episode_draws * varied + sensors.FIRST_DRAWS * senses
-        z = seeding.uniforms(key, count, self.dtype)
-        z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
-        constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
-        state = task.start(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
-        zero = torch.zeros_like(episode)
-        rows = () if drawn is None else drawn.unbind(0)
-        if varied and drawn is None:
-            rows = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt)
-        still = torch.zeros_like(seed, dtype=self.dtype)
-        forces = self.params.action_size
-        actuator = noise.resting((still,) * forces, task.control_dt)
-        read = sensors.first(self.model(rows), state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
-        fields: Any = state, constants, zero, episode, seed, rows, actuator, (), read
+        noise, senses = self.randomization, self.observation == "sensors"
+        z = seeding.uniforms(seeding.key(seed, episode, 0 * episode), start_draws(self.task, noise, senses), self.dtype)
+        given = (None if part is None else part.unbind(0) for part in (x, c, drawn))
+        made = start(self.task, self.params, noise, z, senses, *given)
+        zero, still = torch.zeros_like(episode), torch.zeros_like(seed, dtype=self.dtype)
+        fields: Any = made.x, made.c, zero, episode, seed, made.drawn, made.actuator, (), made.sensors
         begun: _Rows = BatchState(*fields)
+        forces = self.params.action_size
         return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
 
     def _observe(self, now: _Rows) -> torch.Tensor:
@@ -436,18 +406,24 @@ class BallbotBatch:
 
     def _seen(self, now: _Rows) -> tuple[torch.Tensor, ...]:
         """The present observation with the sensors' noise, which depends on the number of steps taken in the episode."""
-        c = now.c
-        if self.task.clock:
-            c = self.task.at(c, now.steps.to(self.dtype) * self.task.control_dt)
-        return sensors.seen(now.sensors, c) if now.sensors else tuple(self.task.seen(self._sensed(now), c, self.params))
+        return observe(self.task, self.params, self.randomization, self._step_state(now), self._noise(now))
 
     def _sensed(self, now: _Rows) -> tuple[torch.Tensor, ...]:
         if not self.randomization.is_noisy:
             return now.x
+        state = self._step_state(now)
+        return self.randomization.sensed(state.x, self._noise(now), state.drawn, state.steps * self.task.control_dt)
+
+    def _noise(self, now: _Rows) -> tuple[torch.Tensor, ...]:
+        """Uniform numbers for the noise of the present observation; () where there is none."""
+        if not self.randomization.is_noisy:
+            return ()
         key = seeding.key(now.seed, now.episode, now.steps + 1)
         z = seeding.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
-        time = now.steps.to(self.dtype) * self.task.control_dt
-        return self.randomization.sensed(now.x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
+        return z[Randomization.PUSH_DRAWS :]
+
+    def _step_state(self, now: _Rows) -> StepState:
+        return StepState(now.x, now.c, now.steps.to(self.dtype), now.drawn, now.actuator, now.sensors)
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""

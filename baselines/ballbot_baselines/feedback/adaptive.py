@@ -44,7 +44,7 @@ class FilteredController:
 
     def __init__(self, task: Task, params: Robot, ending: str, controller: Controller):
         self._task, self._params, self._controller = task, params, controller
-        self.senses = params.SENSORS and ending == "-ekf"
+        self.senses = bool(params.SENSORS) and ending == "-ekf"
         self.filter = SensorFilter(task, params) if self.senses else TrackFilter(task, params, _TRACKS[ending])
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:

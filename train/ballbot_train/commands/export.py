@@ -36,7 +36,7 @@ def export(
         filter: ekf, for C of a robot with wheels: the file then takes what the robot's sensors show.
     """
     policy = behind(policy, filter)
-    filtered = split(policy)[1] == "ekf" and format == "c" and named_robot(robot).SENSORS
+    filtered = split(policy)[1] == "ekf" and format == "c" and bool(named_robot(robot).SENSORS)
     name, policy = file_part(policy), split(policy)[0] if filtered else policy
     task = task_name(policy, task, robot)
     problem = make_task(task, robot)

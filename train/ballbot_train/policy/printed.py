@@ -26,8 +26,6 @@ _SHARED = {
     casadi.OP_AND: "{0} && {1} ? 1 : 0",
     casadi.OP_OR: "{0} || {1} ? 1 : 0",
     casadi.OP_IF_ELSE_ZERO: "{0} ? {1} : 0",
-    casadi.OP_POW: "real_pow({0}, {1})",
-    casadi.OP_CONSTPOW: "real_pow({0}, {1})",
     casadi.OP_ATAN2: "real_atan2({0}, {1})",
     casadi.OP_ASIN: "real_asin({0})",
     casadi.OP_TANH: "real_tanh({0})",

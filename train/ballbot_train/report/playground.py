@@ -213,7 +213,7 @@ def _model_script(params: Robot, networks: Mapping[str, PolicyNetwork]) -> str:
 def _outcome(task: Task, x: casadi.SX, u: casadi.SX, end: casadi.SX, c: casadi.SX) -> tuple[Any, ...]:
     """Cost of a control step, the index of the limit that it violates, or −1, and whether the episode ends at its goal."""
     did = outcome(task, x, u, end, c, 1)
-    return did.running, did.violated, did.success
+    return -did.reward_cost, did.violated, did.success
 
 
 def _packed(numbers: np.ndarray) -> dict[str, str]:

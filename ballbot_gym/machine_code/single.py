@@ -1,0 +1,253 @@
+"""A control step of one environment in machine code.
+
+`codegen` prints `step` and `observe` of `ballbot_gym.step` as C, and `libraries` compiles it within a fraction of a second,
+once per machine and content. Where that is impossible, environments evaluate the same two functions in Python, several times
+more slowly; the results agree to rounding.
+"""
+
+import ctypes
+import logging
+import struct
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ballbot_gym.machine_code.libraries import NoMachineCodeError, library, shipped_source
+from ballbot_gym.robot import Kind, Randomization, Robot, first_of_kind, named_robot, sensors
+from ballbot_gym.step import Draws, Outcome, Step, StepState, by_engine, closed_form, observation_size, observe, step
+from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.identity import digest, problem_digest
+
+_log = logging.getLogger(__name__)
+
+FLAGS = ("-O1", "-fno-math-errno", "-fno-trapping-math")
+
+_TRIALS = 4
+
+Numbers = tuple[Any, ...]
+
+
+class StepProblem(NamedTuple):
+    """What the code of a step depends on. Constants, what is drawn, and the robot's numbers are arguments of the code."""
+
+    task: Task
+    kind: Kind
+    variation: Randomization
+    senses: bool
+    """Whether sensors are observed, and not the state."""
+    substeps: int
+    """RK4 steps in a control step; 0 where an engine moves the robot."""
+    contact: bool
+    """Whether this engine simulates the floor's force on the ball."""
+
+    def of_episode(self) -> dict[str, int]:
+        """Arguments that stay the same during an episode: names, and how many numbers each has."""
+        robot, drawn = len(self._numbers), self.variation.episode_draws * self.variation.varies_episodes
+        return {
+            "c": len(self.task.constant_names),
+            "drawn": drawn,
+            "robot": robot,
+            "model": robot * self.variation.varies_robot,
+        }
+
+    def of_step(self) -> dict[str, int]:
+        """The other arguments."""
+        kind, variation, engine = self.kind.robot, self.variation, not self.substeps
+        states, actions = len(kind.STATE), len(kind.ACTION)
+        return {
+            "x": states,
+            "steps": 1,
+            "actuator": len(variation.resting((0.0,) * actions, self.task.control_dt)),
+            "sensors": sensors.MEMORY * self.senses,
+            "action": actions,
+            "push": variation.PUSH_DRAWS * variation.pushes,
+            "read": sensors.DRAWS * self.senses,
+            "noise": variation.NOISE_DRAWS * variation.is_noisy,
+            "end": states * engine,
+            "floor": 3 * self.contact,
+            "stable": int(engine),
+        }
+
+    def results(self) -> dict[str, int]:
+        """Results: names, and how many numbers each has."""
+        given, kind = self.of_step(), self.kind.robot
+        return {
+            "outcome": len(Outcome._fields),
+            "clipped": 1,
+            "x": given["x"],
+            "actuator": given["actuator"],
+            "sensors": given["sensors"],
+            "force": given["action"],
+            "grip": 4 * self.kind.grips,
+            "measured": len(kind.MEASUREMENTS),
+            "seen": observation_size(self.task, kind, "sensors" if self.senses else "state"),
+        }
+
+    def computed(self, given: Mapping[str, Numbers]) -> dict[str, Numbers]:
+        """The results that follow from arguments: numbers, or symbols from which the code is printed."""
+        task, dt = self.task, self.task.control_dt
+        robot = self._robot(given["robot"])
+        model = self._robot(given["model"]) if self.variation.varies_robot else robot
+        state = StepState(
+            given["x"], given["c"], given["steps"][0], given["drawn"], given["actuator"], given["sensors"]
+        )
+        z = Draws(given["push"], given["read"], given["noise"])
+        if self.substeps:
+            move = closed_form(dt, self.substeps)
+        else:
+            move = by_engine(given["end"], given["floor"], given["stable"][0], dt)
+        made = step(task, robot, self.variation, state, given["action"], z, move, model)
+        after = made.state
+        return {
+            "outcome": made.outcome,
+            "clipped": (made.clipped,),
+            "x": after.x,
+            "actuator": after.actuator,
+            "sensors": after.sensors,
+            "force": made.force,
+            "grip": made.grip,
+            "measured": robot.measurements(after.x),
+            "seen": observe(task, robot, self.variation, after, z.noise),
+        }
+
+    def code_name(self, robot: Robot) -> str:
+        """What the code is called where wheels keep it; the robot is one of the kind."""
+        task, *rest = self
+        problem = problem_digest(task, named_robot(first_of_kind(robot)))
+        return f"one-{type(task).__name__.lower()}-{digest(problem, [repr(each) for each in rest])}"
+
+    def numbers(self, robot: Robot) -> list[float]:
+        """A robot's numbers, as the code takes them."""
+        return [_value(robot, name) for name in self._numbers]
+
+    @property
+    def _numbers(self) -> tuple[str, ...]:
+        names = self.kind.numbers
+        return (*names, *(name for name in self.kind.robot.SENSORS if self.senses and name not in names))
+
+    def _robot(self, numbers: Numbers) -> Any:
+        return Kind(self.kind.robot, self._numbers).model(numbers)
+
+
+class StepCode:
+    """The code of a step, with memory of its own: that of one environment.
+
+    After a step `seen` is the (no,) observation, `x` the (n,) state and `force` the (m,) force that the actuators applied,
+    all float64. The next step overwrites them.
+    """
+
+    def __init__(self, problem: StepProblem, function: Any):
+        self._problem = problem
+        results, given, fixed = problem.results(), problem.of_step(), problem.of_episode()
+        count, arguments, constant = (sum(sizes.values()) for sizes in (results, given, fixed))
+        memory = bytearray(8 * (count + arguments + constant))
+        numbers = np.frombuffer(memory)
+        self._fixed = numbers[count + arguments :]
+        self._pack = partial(struct.Struct(f"{arguments}d").pack_into, memory, 8 * count)
+        self._call = partial(function, ctypes.c_void_p(numbers.ctypes.data))
+        self._unpack = struct.Struct(f"{count - results['seen']}d").unpack_from
+        self._memory, self.seen = memory, numbers[count - results["seen"] : count]
+        ends = np.cumsum(list(results.values())).tolist()
+        self._slices = slices = [slice(end - size, end) for end, size in zip(ends, results.values(), strict=True)]
+        self.x, self.force = (numbers[slices[list(results).index(name)]] for name in ("x", "force"))
+
+    def begin(self, c: Numbers, drawn: Numbers, robot: Robot, model: Robot) -> None:
+        """Takes what stays the same during an episode: constants, draws, the nominal robot and that of the episode."""
+        problem = self._problem
+        varied = problem.numbers(model) if problem.variation.varies_robot else ()
+        self._fixed[:] = (*c, *drawn, *problem.numbers(robot), *varied)
+
+    def step(
+        self, state: StepState, action: Numbers, z: Draws, moved: tuple[Numbers, Numbers, float] | None
+    ) -> tuple[Step, Numbers]:
+        """One control step, and what the robot measures after it; see `ballbot_gym.step.step`.
+
+        Args:
+            state: before the step.
+            action: in units of the robot's force limit.
+            z: uniform numbers.
+            moved: where an engine moves the robot, the first three arguments of `by_engine`.
+        """
+        x, c, steps, drawn, actuator, read = state
+        if moved is None:
+            self._pack(*x, steps, *actuator, *read, *action, *z[0], *z[1], *z[2])
+        else:
+            end, floor, stable = moved
+            self._pack(*x, steps, *actuator, *read, *action, *z[0], *z[1], *z[2], *end, *floor, stable)
+        self._call()
+        v = self._unpack(self._memory)
+        did, clipped, end, after, later, force, grip, measured, _ = self._slices
+        return Step._make(
+            (
+                StepState._make((v[end], c, steps + 1, drawn, v[after] if actuator else (), v[later] if read else ())),
+                Outcome._make(v[did]),
+                v[force],
+                v[clipped.start],
+                v[grip],
+            )
+        ), v[measured]
+
+
+def step_code(problem: StepProblem, robot: Robot) -> StepCode | None:
+    """The code of a step of robots of one kind, with which it is tried; None where there is none, and the log says why."""
+    try:
+        if problem not in _functions:
+            _functions[problem] = None
+            _functions[problem] = _function(problem, robot)
+        function = _functions[problem]
+    except TypeError:  # a task that has no hash
+        return None
+    except Exception as error:  # no compiler, cache or CasADi, or any error of users' code that gets a symbol
+        _log.info("%s stays in Python: %s: %s", problem.task.id, type(error).__name__, error)
+        return None
+    return None if function is None else StepCode(problem, function)
+
+
+_functions: dict[StepProblem, Callable[..., None] | None] = {}
+
+
+def _function(problem: StepProblem, robot: Robot) -> Callable[..., None]:
+    """The compiled function.
+
+    Raises:
+        NoMachineCodeError: there is no compiler, or the code computes something else than Python.
+        ImportError: CasADi is missing, and no wheel has the code.
+        Exception: any error of a task that cannot compute with symbols.
+    """
+    source = shipped_source(problem.code_name(robot)) if find_spec("casadi") is None else None
+    if source is None:
+        from ballbot_gym.machine_code import codegen  # it imports CasADi
+
+        source = codegen.single_source(problem)
+    path = library(f"one-{type(problem.task).__name__.lower()}", source, FLAGS)
+    function = ctypes.PyDLL(str(path)).compute  # it keeps the GIL: it is short
+    function.argtypes, function.restype = (ctypes.c_void_p,), None
+    _check(problem, function, robot)
+    return function
+
+
+def _check(problem: StepProblem, function: Callable[..., None], robot: Robot) -> None:
+    """Raises a NoMachineCodeError if code computes something else than Python, as where a symbol was taken for a number."""
+    rng = np.random.default_rng(0)
+    sizes = problem.of_step() | problem.of_episode()
+    count = sum(problem.results().values())
+    own = tuple(problem.numbers(robot))
+    for _ in range(_TRIALS):
+        given = {name: tuple(rng.uniform(0.05, 0.5, size).tolist()) for name, size in sizes.items()}
+        given |= {name: own for name in ("robot", "model") if sizes[name]}
+        expected = [float(part) for parts in problem.computed(given).values() for part in parts]
+        numbers = np.array([0.0] * count + [part for name in sizes for part in given[name]])
+        function(ctypes.c_void_p(numbers.ctypes.data))
+        if not np.allclose(numbers[:count], expected, rtol=1e-6, atol=1e-9, equal_nan=True):
+            raise NoMachineCodeError(
+                f"{problem.task.id} computes something else with CasADi's symbols than with numbers"
+            )
+
+
+def _value(robot: Any, name: str) -> float:
+    for part in name.split("."):
+        robot = getattr(robot, part)
+    return robot
