@@ -104,6 +104,11 @@ def named_task(name: Any) -> str:
     return short
 
 
+def own_robot(task: str, robot: str = PAPER) -> str:
+    """The name of the robot that does a task where one is named, or the default: then it is the one that the task names."""
+    return TASKS[named_task(task)].ROBOT if robot == PAPER else robot
+
+
 def name_of(task: Task) -> str | None:
     """The name in `TASKS` of a task's class; None where it has none."""
     return next((name for name, kind in TASKS.items() if type(task) is kind), None)

@@ -17,14 +17,14 @@ from ballbot_gym.robot import ROBOTS
 from ballbot_train import evaluate
 from ballbot_train.cli import _run as main
 
-FILE = Path(__file__).parent.parent / "examples" / "cart_pole.py"
+FILE = Path(__file__).parent.parent / "examples" / "classic" / "src" / "ballbot_classic" / "cart_pole.py"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     """What the example registers is gone after these tests."""
     yield
-    TASKS.pop("swing_up", None)
+    TASKS.pop("cart_pole", None)
     ROBOTS.pop("cart_pole", None)
     gymnasium.registry.pop("CartPoleSwingUp-v0", None)
     sys.modules.pop("cart_pole", None)
@@ -44,7 +44,7 @@ def cart_pole():
 
 @pytest.fixture
 def env(cart_pole):
-    with BallbotEnv("swing_up", render_mode="rgb_array") as env:
+    with BallbotEnv("cart_pole", render_mode="rgb_array") as env:
         yield env
 
 
@@ -84,8 +84,8 @@ def test_its_environment_passes_gymnasiums_checks_and_has_a_picture(env):
 
 
 def test_one_env_many_and_a_batch_move_alike(env):
-    many = BallbotVectorEnv(3, task="swing_up", dtype="float64")
-    batch = BallbotBatch("swing_up", 3, dtype="float64", compile=False)
+    many = BallbotVectorEnv(3, task="cart_pole", dtype="float64")
+    batch = BallbotBatch("cart_pole", 3, dtype="float64", compile=False)
     observations, info = many.reset(seed=0)
     batch.reset(seed=0)
     assert observations.shape == (3, 4)
@@ -104,11 +104,11 @@ def test_one_env_many_and_a_batch_move_alike(env):
 def test_its_optimum_swings_up_and_nmpc_nearly_reaches_it(cart_pole, env):
     rng, robot = np.random.default_rng(0), cart_pole.CartPole()
     x, c = env.task.sample(rng, robot)
-    optimum = find_optimum("swing_up", "cart_pole", x, c)
+    optimum = find_optimum("cart_pole", "cart_pole", x, c)
     assert optimum.is_optimal
     assert env.task.is_goal(optimum.trajectory.x[-1], c)
     assert np.abs(optimum.trajectory.u).max() <= robot.force_limit
-    (together,) = find_optima("swing_up", "cart_pole", x[None], c[None])
+    (together,) = find_optima("cart_pole", "cart_pole", x[None], c[None])
     assert together is not None
     assert together.cost == pytest.approx(optimum.cost, rel=1e-6)
     for name, least, most in (("lqr", 1.0, np.inf), ("trajopt", 0, 0.05), ("nmpc", 0, 0.01)):
@@ -126,21 +126,21 @@ def test_its_lqr_holds_the_pole_up(cart_pole, env):
 
 def test_a_ballbots_robot_is_refused_by_a_message_that_names_the_right_one(cart_pole):
     with pytest.raises(ValueError, match="robot='cart_pole'"):
-        BallbotEnv("swing_up", robot="omni")
+        BallbotEnv("cart_pole", robot="omni")
     with pytest.raises(ValueError, match="give physics='rk4'"):
-        BallbotEnv("swing_up", physics="mujoco")
+        BallbotEnv("cart_pole", physics="mujoco")
 
 
 @pytest.mark.slow
 def test_commands_measure_and_train_it(cart_pole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cart_pole.py").write_text(FILE.read_text())
-    of = ["--task", "swing_up", "--robot", "cart_pole"]
+    of = ["--task", "cart_pole", "--robot", "cart_pole"]
     assert main(["benchmark", "--tasks", *of[1:], "--controllers", "nmpc", "--episodes", "2", "--out", "b"]) == 0
     assert "nmpc" in (tmp_path / "b" / "leaderboard.md").read_text()
     few = ["--iterations", "2", "--evaluations", "1", "--test-episodes", "2", "--validation-episodes", "2"]
     assert main(["train", "ppo", *of, *few, "--num-envs", "64", "--out", "p"]) == 0
-    row = evaluate(str(tmp_path / "p" / "policy.json"), "swing_up", episodes=2, robot="cart_pole")
+    row = evaluate(str(tmp_path / "p" / "policy.json"), "cart_pole", episodes=2, robot="cart_pole")
     assert row.episodes == 2
 
 

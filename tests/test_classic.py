@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -11,8 +12,9 @@ import pytest
 import ballbot_baselines
 import ballbot_gym
 import ballbot_train
-from ballbot_baselines import find_optimum
-from ballbot_gym import TASKS, BallbotEnv, named_robot
+from ballbot_baselines import VARIANTS, find_optimum
+from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_gym import TASKS, BallbotEnv, named_robot, rollout
 from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.robot import ROBOTS
 from ballbot_train import RegretWrapper, evaluate
@@ -104,8 +106,6 @@ def test_the_angle_may_wrap_and_the_rate_be_clipped_along_the_optimum():
 
 
 def test_swings_of_either_side_and_number_are_compared(classic):
-    from ballbot_baselines.solvers.shooting import Backoff, Shooting
-
     task, robot = make_task("pendulum"), named_robot("pendulum")
     x, c = task.sample(np.random.default_rng(3), robot)
     found = sorted(each.cost for each in task.search_cases(Shooting(task, robot, x, c, Backoff())) if each.is_optimal)
@@ -164,6 +164,41 @@ def test_the_wrapper_takes_own_environments_and_many_at_once(own_cache):
     assert infos["regret"][0] == pytest.approx(info["regret"], rel=1e-5)
     with pytest.raises(ValueError, match="unknown task 'Acrobot-v1'"):
         RegretWrapper(gymnasium.make("Acrobot-v1"))
+
+
+def test_kellys_cart_pole_ends_upright_with_the_least_effort():
+    task, robot = make_task("kelly_cart_pole"), named_robot("kelly_cart_pole")
+    optimum = find_optimum(task, robot, np.array([0.0, math.pi, 0.0, 0.0]), np.zeros(0))
+    x, effort = optimum.trajectory.x, optimum.trajectory.u[:, 0]
+    assert optimum.is_optimal
+    assert optimum.cost == pytest.approx(task.control_dt * np.sum(effort**2))
+    assert task.is_goal(x[-1], np.zeros(0))
+    assert np.abs(x[:, 0]).max() <= task.track
+    finer = replace(task, control_dt=0.01)
+    again = find_optimum(finer, robot, np.array([0.0, math.pi, 0.0, 0.0]), np.zeros(0))
+    assert again.cost == pytest.approx(optimum.cost, rel=0.02)  # forces are held for half as long
+
+
+def test_without_a_torque_the_acrobots_energy_stays():
+    robot, x = named_robot("acrobot"), np.array([2.0, 0.5, 1.0, -1.0])
+    before = robot.energy(x)
+    for _ in range(100):
+        x = robot.step(x, np.zeros(1), 0.01, 1)
+    assert robot.energy(x) == pytest.approx(before, rel=1e-6)
+
+
+def test_an_acrobots_swing_ups_of_other_sides_cost_more_than_the_optimum():
+    task, robot = make_task("acrobot"), named_robot("acrobot")
+    x, c = task.sample(np.random.default_rng(0), robot)
+    optimum = find_optimum(task, robot, x, c)
+    assert optimum.is_optimal
+    assert task.is_goal(optimum.trajectory.x[-1], c)
+    found = task.search_cases(Shooting(task, robot, x, c, Backoff()))
+    assert max(each.cost for each in found if each.is_optimal) > 1.2 * optimum.cost
+    with BallbotEnv("acrobot") as env:
+        run = rollout(env, VARIANTS["optimum"](task, robot), options={"state": x})
+    assert run.success
+    assert run.cost == pytest.approx(optimum.cost, rel=1e-6)
 
 
 def test_the_packages_do_not_name_them():

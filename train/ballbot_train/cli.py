@@ -33,6 +33,7 @@ _DESCRIPTION = "Ballbot control, measured by its regret against the best that ph
 _LEAST_WIDTH = 60
 _NO_READER = 141  # the exit status of a process that the signal SIGPIPE ended
 _ID = re.compile(r"([\w-]+/)?\w+-v\d+")  # of an environment
+_HYPHENS = re.compile("[a-z0-9]+(-[a-z0-9]+)+")
 _MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[a-z][a-z0-9_]*")
 
 
@@ -156,8 +157,8 @@ def _announce_compilation() -> None:
 
 def _registered(options: list[str]) -> list[str]:
     """The options with the names of tasks, robots and physics that they bring: of MODULE:NAME the module is imported, from
-    this folder too, a path after --robot is registered under its file's name, and other names become ours: the id of a task,
-    and "pybullet".
+    this folder too, a path after --robot is registered under its file's name, and other names become ours: the id of a task
+    or of its counterpart, a task with hyphens, and "pybullet".
     """
     from ballbot_gym.engines import PHYSICS_ALIASES
     from ballbot_gym.robot import register_robot, short_name
@@ -177,7 +178,11 @@ def _registered(options: list[str]) -> list[str]:
         elif _ID.fullmatch(word) and "--out" not in (flag, *named[-1:]):
             from ballbot_gym.tasks import TASKS
 
-            word = next((name for name, kind in TASKS.items() if kind.id == word), word)
+            word = next((name for name, kind in TASKS.items() if word in (kind.id, kind.counterpart)), word)
+        elif not flag and _HYPHENS.fullmatch(word) and named and "--out" != named[-1]:
+            from ballbot_gym.tasks import TASKS
+
+            word = word.replace("-", "_") if word.replace("-", "_") in TASKS else word
         elif word in PHYSICS_ALIASES and "--out" not in (flag, *named[-1:]):
             word = PHYSICS_ALIASES[word]
         named.append(f"{flag}{equals}{word}")

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import certified, files
+from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Ballbot, checked_randomization, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
@@ -41,7 +42,7 @@ def benchmark(
         seed: of the bootstrap intervals, and of everything that an episode draws.
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
-        robot: name of the robot, with its episodes and controllers.
+        robot: name of the robot, with its episodes and controllers; default, the robot that each task names.
         randomization: names of tracks, "unknown", "late", "noisy" or "real". Their robots, delays and sensors are hidden from
             the controllers. The result is then one table of controllers by tracks, with the parts of their regret. By default
             the experts that are made for each track run.
@@ -49,7 +50,8 @@ def benchmark(
     """
     made_for = controllers_of(tasks, controllers, [robot], filter, tracks=bool(randomization))
     chosen = made_for[robot]
-    physics = physics_or_default(physics, robot)
+    robots = {task: own_robot(task, robot) for task in tasks}
+    physics = physics_or_default(physics, robots[tasks[0]])
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:
         for track in randomization:
@@ -64,22 +66,22 @@ def benchmark(
         title = f"{episodes} certified episodes per task and track, physics={physics}"
         publish(out, "tracks", title, robustness.TRACK_TABLE, rows, results, facts)
         return
-    groups = [Group(task, name, physics, robot) for task, names in chosen.items() for name in names]
+    groups = [Group(task, name, physics, robots[task]) for task, names in chosen.items() for name in names]
     done = run_groups(groups, episodes, out, workers, seed, record=True)
     rows, ways = leaderboard(done, seed), facts.get("trained_by", {})
     regrets = figures.save(figures.regret_figure(done, ways), out / "figures" / "regret.png")
     replays, pictures = [], []
     for task, names in chosen.items():
         episode = telling_episode(task, done)
-        replays.append(certified_replay(task, names, episode, physics, skip_planless=True, robot=robot))
-        kept = certified.load(task, robot, episodes=range(episode + 1)).trajectories  # of the first episodes
+        replays.append(certified_replay(task, names, episode, physics, skip_planless=True, robot=robots[task]))
+        kept = certified.load(task, robots[task], episodes=range(episode + 1)).trajectories  # of the first episodes
         optimum = [Take("optimum", each, "0.35", style="--") for each in kept[episode : episode + 1]]
         takes = [*optimum, *replays[-1].takes]
-        figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers, named_robot(robot))
+        figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers, named_robot(robots[task]))
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    drawn = replays if isinstance(named_robot(robot), Ballbot) else []  # the page draws ballbots
+    drawn = [each for each, name in zip(replays, chosen, strict=True) if isinstance(named_robot(robots[name]), Ballbot)]
     report = report_page(title, drawn, [*TABLE], table_cells(TABLE, rows, ways), shown, facts)
     page = files.write(out / "report.html", report)
     title = f"{episodes} certified episodes per task, physics={physics}"

@@ -2,7 +2,7 @@
 
 Importing this file registers both. Then all commands for ballbots work here too:
 
-    ballbot benchmark --task examples.cart_pole:swing_up --robot examples.cart_pole:cart_pole --controllers trajopt nmpc
+    ballbot benchmark --task ballbot_classic.cart_pole:cart_pole --controllers trajopt nmpc
 """
 
 import math
@@ -128,4 +128,4 @@ class SwingUp(Task):
 
 
 register_robot("cart_pole", CartPole())
-register_task(SwingUp, "swing_up")
+register_task(SwingUp, "cart_pole")
