@@ -179,7 +179,7 @@ def _registered(options: list[str]) -> list[str]:
             from ballbot_gym.tasks import TASKS
 
             word = next((name for name, kind in TASKS.items() if word in (kind.id, kind.counterpart)), word)
-        elif not flag and _HYPHENS.fullmatch(word) and named and "--out" != named[-1]:
+        elif not flag and _HYPHENS.fullmatch(word) and named and named[-1] != "--out":
             from ballbot_gym.tasks import TASKS
 
             word = word.replace("-", "_") if word.replace("-", "_") in TASKS else word

@@ -129,13 +129,8 @@ class PendulumUp(Task):
         theta, rate = np.full(len(torque), x[0]), np.full(len(torque), x[1])
         states, torques, costs = [(theta, rate)], [], np.zeros(len(torque))
         for k in range(self.steps):
-            angle = theta - _TURN * np.floor((theta + math.pi) / _TURN)
-            energy = 0.5 * rate * rate + 1.5 * params.gravity / params.length * (np.cos(theta) - 1)
-            pumping = -4.0 * (energy - surplus) * np.where(rate < 0, -1.0, 1.0)
             pushed = np.where(k < first, 1.0, np.where(k < first + second, -1.0, 0.0))
-            pumping = np.where(pushed == 0, pumping, side * pushed * torque)
-            near = (np.abs(angle) < 0.5) & (np.abs(rate + 3.9 * angle) < 1.2)
-            u = np.clip(np.where(near, -10 * angle - 2.6 * rate, pumping), -torque, torque)
+            u = np.where(pushed == 0, _shaped(params, theta, rate, torque, surplus), side * pushed * torque)
             costs += self.control_dt * self.cost((theta, rate), (u,), ())
             theta, rate = params.step((theta, rate), (u,), self.control_dt)
             states.append((theta, rate))
@@ -150,6 +145,29 @@ class PendulumUp(Task):
         from ballbot_classic.pendulum_cases import solutions  # it needs CasADi
 
         return solutions(self, episode)
+
+
+class EnergyShaping:
+    """A controller of few lines: it pumps until the energy suffices, and catches the pendulum near upright."""
+
+    def __init__(self, task: Task, params: Any):
+        self._params = params
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        """Nothing is planned."""
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        """(1,) torque, N·m, in state x (2,)."""
+        return _shaped(self._params, x[:1], x[1:], self._params.force_limit, 0.0)
+
+
+def _shaped(params: Any, theta: np.ndarray, rate: np.ndarray, torque: Any, surplus: Any) -> np.ndarray:
+    """(n,) torques, of at most `torque`: they pump up to the energy of upright and a surplus, and hold the pendulum."""
+    angle = theta - _TURN * np.floor((theta + math.pi) / _TURN)
+    energy = 0.5 * rate * rate + 1.5 * params.gravity / params.length * (np.cos(theta) - 1)
+    pumping = -4.0 * (energy - surplus) * np.where(rate < 0, -1.0, 1.0)
+    near = (np.abs(angle) < 0.5) & (np.abs(rate + 3.9 * angle) < 1.2)
+    return np.clip(np.where(near, -10 * angle - 2.6 * rate, pumping), -torque, torque)
 
 
 register_robot("pendulum", Pendulum())
