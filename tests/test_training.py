@@ -278,7 +278,7 @@ class Stand(Stabilize):
 
 
 SMALL = {
-    "dagger": {"episodes_per_iteration": 1, "label_seconds": 0.1, "gradient_steps": 2},
+    "dagger": {"episodes_per_iteration": 1, "gradient_steps": 2},
     "ppo": {"num_envs": 4, "num_steps": 8, "batch_size": 32},
     "sac": {"num_envs": 2, "num_steps": 2, "batch_size": 4},
     "apg": {"num_envs": 4, "episode_seconds": 0.06, "iterations": 3},

@@ -10,7 +10,7 @@ from ballbot_gym.robot import PAPER, Robot, named_robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.fitting import start_as_lqr
-from ballbot_train.policy.files import PolicySpec
+from ballbot_train.policy.files import Activation, PolicySpec
 from ballbot_train.policy.network import PolicyNetwork
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
@@ -33,9 +33,11 @@ def spec_for(
     history: int = 0,
     robot: str = PAPER,
     informed: bool = False,
+    activation: Activation = "tanh",
 ) -> PolicySpec:
     """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
 
+    Layers of tanh are odd without biases. Others are averaged over opposite observations instead.
     Three wheels do not have the task's symmetry, so a robot with wheels does without.
 
     Raises:
@@ -58,13 +60,17 @@ def spec_for(
     if missing:
         others = 'give "none", "mirrors", "frame" or another as its symmetry'
         raise ValueError(f"{task.id} has no {missing}; {others}")
+    odd = symmetry == "odd" and activation == "tanh"
     mirrors = task.mirrors if symmetry == "mirrors" else ()
+    if symmetry == "odd" and not odd:
+        mirrors = tuple(mirror for mirror in task.mirrors if set(mirror.state) == {-1})
     return PolicySpec.of(
         task,
         robot,
         hidden=hidden,
+        activation=activation,
         linear=linear,
-        odd=symmetry == "odd",
+        odd=odd,
         frame=frames.get(symmetry),
         routes=_ROUTES if symmetry == "routes" else (),
         centred=symmetry == "centred",
@@ -76,10 +82,16 @@ def spec_for(
 
 
 def actor_for(
-    task: Task, params: Robot, config: Any, history: int, informed: bool, start: PolicyNetwork | None
+    task: Task,
+    params: Robot,
+    config: Any,
+    history: int,
+    informed: bool,
+    start: PolicyNetwork | None,
+    activation: Activation = "tanh",
 ) -> PolicyNetwork:
     """A policy to train, of the config's symmetry and hidden layers, that starts as LQR; or `start` as `started` makes it."""
-    spec = spec_for(task, config.symmetry, config.hidden, True, history, registered_name(params), informed)
+    spec = spec_for(task, config.symmetry, config.hidden, True, history, registered_name(params), informed, activation)
     if start is not None:
         return started(start, spec)
     made = PolicyNetwork(spec)

@@ -6,14 +6,21 @@ optimum is searched again, and the episode runs again from there (Ross et al., "
 structured prediction to no-regret online learning", 2011, with the mixture β of expert and learner drawn per episode).
 
 The feedback about an optimum is the derivative of the optimal force with respect to the state. It labels every state that an
-episode reaches near its optimum. Errors are divided by the cost of the episode's optimum, as in the regret.
+episode reaches near its optimum, and the states around it too: every batch draws new ones, whose labels differ by −K δ. This
+fits the slope of the policy together with its value, as in Czarnecki et al., "Sobolev training for neural networks" (2017).
+There are three exceptions, whose states label themselves alone. If a goal ends the episode, the derivative is that for a given
+time of arrival, which a policy does not observe. Next to an obstacle the derivative is too steep to guide more than the
+smallest changes. And if observations depend on the past, on noise or on forces that are on their way, they are not known for
+other states.
 
-On a track the expert has access to each episode's robot. The learner gets observations alone.
+Errors are divided by the cost of the episode's optimum, as in the regret. On a track the expert has access to each episode's
+robot. The learner gets observations alone.
 """
 
 import contextlib
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,23 +49,21 @@ from ballbot_train.policy.network import PolicyNetwork
 class DaggerConfig(Settings):
     """Settings of `Dagger`."""
 
-    iterations: int = number(60, 1, MOST)
+    iterations: int = number(40, 1, MOST)
     """Number of iterations."""
-    gathering_iterations: int = number(40, 0, MOST)
+    gathering_iterations: int = number(4, 0, MOST)
     """First of them that gather samples; 0: clone --demos."""
-    evaluations: int = number(10, 1, MOST)
+    evaluations: int = number(5, 1, MOST)
     """Evaluations, at equal distances."""
     episodes_per_iteration: int = number(512, 1, MOST)
     """Episodes of a gathering iteration, of two optima each."""
-    label_seconds: float = number(5.0, 0)
-    """Part of an optimum that becomes samples, s."""
     backoff: Backoff = Backoff(grip=EXECUTED.grip)
     """What optima keep from their limits."""
-    gradient_steps: int = number(1500, 1, MOST)
+    gradient_steps: int = number(500, 1, MOST)
     """Gradient steps per iteration."""
-    batch_size: int = number(1024, 1, MOST)
+    batch_size: int = number(256, 1, MOST)
     """Samples per gradient step."""
-    learning_rate: float = number(3e-3, above=0)
+    learning_rate: float = number(6e-3, above=0)
     """Learning rate; it falls along half a cosine."""
     hidden: tuple[int, ...] = number((128, 128), 1, 2**14)
     """Units of hidden layers."""
@@ -66,21 +71,38 @@ class DaggerConfig(Settings):
     """What the actor keeps of the task's symmetry."""
 
 
+# where samples label themselves alone, more optima are needed, see the top of this file
+_ALONE: dict[str, Any] = {
+    "iterations": 60,
+    "gathering_iterations": 40,
+    "gradient_steps": 1500,
+    "batch_size": 1024,
+    "learning_rate": 3e-3,
+}
+
 TUNED: dict[str, DaggerConfig] = {
     "": DaggerConfig(),
-    "stabilize": DaggerConfig(symmetry="odd"),
-    "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
+    "stabilize": DaggerConfig(
+        iterations=20, gathering_iterations=2, gradient_steps=400, learning_rate=1e-2, hidden=(64, 64), symmetry="odd"
+    ),
+    "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip), **_ALONE),
     # plans at the force limit leave no force for corrections
-    "orbit": DaggerConfig(symmetry="frame", hidden=(256, 256), backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
+    "orbit": DaggerConfig(symmetry="frame", backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
     "weave": DaggerConfig(
-        symmetry="routes", hidden=(256, 256), backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip)
+        symmetry="routes",
+        backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip),
+        hidden=(256, 256),
+        **_ALONE,
     ),
 }
 """Exceptions by name of task; every other task takes the defaults."""
 
+_SECONDS = 5.0  # of an optimum that become samples
+_STATES = 32  # of each optimum that become samples, on average
+_AROUND = {"m": 0.05, "rad": 0.05, "m/s": 0.15, "rad/s": 0.15}
+"""Largest standard deviations of the states around a sample, by the unit of a component; others stay."""
 # of the expert's actions, and where the ball may slip: each episode draws the deviation of its noise from 0 to this
 _NOISE, _NOISE_IN_GRIP = 0.2, 0.05
-_STATES = 32  # of each optimum that become samples, on average
 _SMALL = 0.3  # of the force limit: a derivative is no guide to greater changes
 _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 # the scale of a distance in each component of a state, SI units
@@ -129,6 +151,39 @@ class _Optima:
             self.forces[i, :n], self.gains[i, :n] = plan.u, optimum.gains
 
 
+@dataclass
+class _Labels(Samples):
+    """Samples, of which those near optima label the states around them too.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | states | (n, 8) float32 | SI units; NaN where a sample labels its own observation alone |
+    | constants | (n, nc) float32 | of the episodes |
+    | gains | (n, 2, 8) float32 | K: the action at states + δ is actions − K δ |
+    """
+
+    states: torch.Tensor
+    constants: torch.Tensor
+    gains: torch.Tensor
+    around: np.ndarray
+    """(8,) standard deviations of δ at most, SI units."""
+    observe: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+    """From states (m, 8) and constants (m, nc) to observations (m, no)."""
+
+    def draw(self, count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        rows = torch.as_tensor(rng.integers(len(self), size=count))
+        observations, actions, states = self.observations[rows], self.actions[rows], self.states[rows]
+        known = states[:, 0].isfinite()[:, None]
+        if known.any():
+            share = rng.random((count, 1), dtype=np.float32) * self.around
+            off = torch.as_tensor(share * rng.standard_normal(share.shape, dtype=np.float32))
+            change = (self.gains[rows] @ off[..., None])[..., 0]
+            less = (_SMALL / change.abs().amax(1, keepdim=True).clamp(min=_SMALL)).where(known, 0.0)
+            actions = (actions - less * change).clamp(-1, 1)
+            observations = self.observe(states + less * off, self.constants[rows]).where(known, observations)
+        return observations, actions, self.weights[rows]
+
+
 class Dagger:
     """The learner; see `training.Learner`. An iteration's random numbers depend on seed and iteration alone."""
 
@@ -145,16 +200,21 @@ class Dagger:
     ):
         """See `Algorithm.make`. Demonstrations are its first samples."""
         on_track, robot = randomization is not None or history > 0, registered_name(params)
-        samples = _first_samples(demos, task, robot, config, on_track)
+        shown = _demonstrations(demos, task, robot, config, on_track)
         self.config, self.iteration, self._warm = config, 0, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization or Randomization(), history
         torch.manual_seed(seed)
-        self.network = actor_for(task, params, config, history, False, start)
+        varied = self._randomization
+        present = not (history or varied.varies_actuator or varied.is_noisy)
+        self._around = present and not task.first_exit and task.routed_frame is None
+        """Whether samples label the states around them too; see the top of this file."""
+        # slopes are fitted best by smooth layers that are not bounded
+        self.network = actor_for(task, params, config, history, False, start, "silu" if self._around else "tanh")
         self._fit = Fit(self.network)
-        none = np.zeros((0, self.network.spec.seen))
-        self._samples = Samples.of(none, np.zeros((0, params.action_size))) if samples is None else samples
+        empty = np.zeros((0, self.network.spec.seen)), np.zeros((0, params.action_size)), np.zeros(0)
+        self._samples = self._samples_of(*(shown or empty))
 
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes
@@ -170,15 +230,12 @@ class Dagger:
         return {"loss/imitation": loss, "train/learning_rate": rate, "train/samples": len(self._samples), **figures}
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "iteration": self.iteration,
-            "samples": [self._samples.observations, self._samples.actions, self._samples.weights],
-            **self._fit.state_dict(),
-        }
+        return {"iteration": self.iteration, "samples": self._samples.tensors(), **self._fit.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.iteration = state["iteration"]
-        self._samples = Samples(*state["samples"])
+        for name, tensor in state["samples"].items():
+            setattr(self._samples, name, tensor)
         self._fit.load_state_dict(state)
 
     def _gather(self, rng: np.random.Generator) -> dict[str, float]:
@@ -250,31 +307,38 @@ class Dagger:
         if before is not None:
             costs = np.where(before[0].solved, before[0].costs, costs)
             usable &= _goes_on(optima, *before)
-        steps = max(1, round(self.config.label_seconds / task.control_dt))
+        steps = max(1, round(_SECONDS / task.control_dt))
         expert = rng.random((len(robots), 1)) < 0.5
         noise = (_NOISE_IN_GRIP if self._params.grips else _NOISE) * rng.random((len(robots), 1))
         states, lasted, running = [], np.zeros(len(robots), int), np.ones(len(robots), bool)
-        seen, labels, weights = [], [], []
+        found: list[_Labels] = []
         for k in range(min(steps, task.steps)):
             states.append(state)
             lasted += running
             observation = batch.observe(state)
-            label, near = self._labels(optima, self._ahead(batch, state), k, limits)
-            near &= running & usable & (rng.random(len(near)) < _STATES / steps)
-            seen.append(observation[near])
-            labels.append(label[near])
-            weights.append(1 / np.maximum(costs[near], _MIN_COST))
+            x = self._ahead(batch, state)
+            label, near, gains = self._labels(optima, x, k, limits)
+            # where samples label the states around them, the early ones matter most: these differ most from each other
+            share = 0.5 * _STATES / math.sqrt(steps * (k + 0.5)) if self._around else _STATES / steps
+            near &= running & usable & (rng.random(len(near)) < share)
+            around = (x[near], c[near], gains[near]) if self._around else None
+            found.append(
+                self._samples_of(observation[near].numpy(), label[near], 1 / np.maximum(costs[near], _MIN_COST), around)
+            )
             with torch.no_grad():
                 actions = np.where(expert, label + noise * rng.standard_normal(label.shape), self.network(observation))
             state, result = batch.transition(state, torch.as_tensor(actions))
             running &= ~(result.terminated | result.truncated).numpy()
             if not running.any():
                 break
-        self._samples.add(Samples.of(torch.cat(seen).numpy(), np.concatenate(labels), np.concatenate(weights)))
+        self._samples.add(*found)
         return states, lasted, optima
 
-    def _labels(self, optima: _Optima, x: np.ndarray, k: int, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The optimal actions (B, 2) in states x (B, 8) about control step k, and whether each state is near its optimum.
+    def _labels(
+        self, optima: _Optima, x: np.ndarray, k: int, limits: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The optimal actions (B, 2) in states x (B, 8) about control step k, whether each state is near its optimum, and
+        the feedback (B, 2, 8) of actions there.
 
         A policy does not know the time. So what counts is the nearest state of the optimum, which may be some steps away.
         """
@@ -285,7 +349,27 @@ class Dagger:
         at = around[distances.argmin(1)]
         change = -np.einsum("bij,bj->bi", optima.gains[rows, at], x - optima.states[rows, at])
         near = (np.abs(change) < _SMALL * limits).all(1) & np.isfinite(distances.min(1))
-        return np.clip((optima.forces[rows, at] + change) / limits, -1, 1), near
+        gains = optima.gains[rows, at] / limits[..., None]
+        return np.clip((optima.forces[rows, at] + change) / limits, -1, 1), near, gains
+
+    def _samples_of(
+        self,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        weights: np.ndarray,
+        around: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    ) -> _Labels:
+        """Samples; `around` holds the states, constants and gains of those that label the states around them too."""
+        own, params = Samples.of(observations, actions, weights), self._params
+        shapes = (params.state_size,), (len(self._task.constant_names),), (params.action_size, params.state_size)
+        more = around or [np.full((len(own), *shape), np.nan) for shape in shapes]
+        tensors = (torch.as_tensor(part, dtype=torch.float32) for part in more)
+        scale = np.array([_AROUND.get(quantity.unit, 0.0) for quantity in params.STATE], np.float32)
+        return _Labels(own.observations, own.actions, own.weights, *tensors, around=scale, observe=self._observed)
+
+    def _observed(self, states: torch.Tensor, constants: torch.Tensor) -> torch.Tensor:
+        """Observations (n, no) of states (n, 8) of episodes with constants (n, nc)."""
+        return torch.stack(tuple(self._task.seen(states.unbind(1), constants.unbind(1), self._params)), 1)
 
     def _optima_of(self, robots: Sequence[Robot], x: np.ndarray, c: np.ndarray) -> _Optima:
         """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours."""
@@ -336,10 +420,10 @@ def _goes_on(optima: _Optima, before: _Optima, at: np.ndarray) -> np.ndarray:
     return (np.abs(optima.states - then)[..., :2].max((1, 2)) < _SAME_WAY) | ~before.solved
 
 
-def _first_samples(
+def _demonstrations(
     demos: str | Path | None, task: Task, robot: str, config: DaggerConfig, on_track: bool
-) -> Samples | None:
-    """Demonstrations, if there are any; raises a ValueError where they do not fit."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Observations, actions and weights of demonstrations, if there are any; raises a ValueError if they do not fit."""
     if demos is None:
         if config.gathering_iterations:
             return None
@@ -350,7 +434,7 @@ def _first_samples(
         )
     loaded = load_demos(demos, task, robot)
     weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
-    return Samples.of(loaded.observations, loaded.actions, weights)
+    return loaded.observations, loaded.actions, weights
 
 
 make = Dagger

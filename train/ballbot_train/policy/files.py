@@ -33,6 +33,9 @@ _MOST_UNITS = 1_000_000  # of a layer
 _DESCRIPTION_LIMIT = 2**24  # bytes
 
 
+Activation = Literal["tanh", "relu", "silu"]
+"""What follows each hidden layer of a policy."""
+
 Mirrors = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 """Signs of the observation and of the action in each mirror image."""
 
@@ -56,7 +59,7 @@ class PolicySpec:
     """Size of an observation."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers."""
-    activation: Literal["tanh", "relu", "silu"] = "tanh"
+    activation: Activation = "tanh"
     """After each hidden layer."""
     linear: bool = True
     """Whether a linear part is added to the network's output."""
