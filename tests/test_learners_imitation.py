@@ -48,10 +48,11 @@ def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos):
     assert goes_on_as_if_never_stopped(lambda seed: dagger.make(task, params, TINY_DAGGER, 0, demos))
 
 
-def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way():
+def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way(monkeypatch):
     """A label is the optimal force from where the robot will be once the last force, which the learner sees, has acted."""
     task, params = make_task("stabilize"), default_params()
     drawn = Randomization(body_mass=(1.3, 1.3), force=(0.9, 0.9), actuator_delay=(0.02, 0.02))
+    monkeypatch.setattr(dagger, "_SECONDS", 0.5)  # of every state a sample is made
     config = replace(TINY_DAGGER, episodes_per_iteration=32)
     learner = dagger.make(task, params, config, 0, None, randomization=drawn, history=1)
     assert learner.iterate()["train/labelled"] > 0.5  # from some states no robot so heavy and weak can be saved
@@ -64,8 +65,8 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way():
     first = {i: optimum.trajectory.u[0] for i, optimum in found if optimum}
     solved, forces = list(first), np.array(list(first.values()))
     off = np.abs(actions[solved] - np.clip(forces / robot.force_limit, -1, 1)).max(1)
-    assert np.percentile(off, 25) < 1e-5  # before the first noise: an optimum goes on being optimal
-    assert np.percentile(off, 90) < 0.1  # after it: feedback about the optimum is linear
+    assert np.percentile(off, 25) < 1e-5  # where the expert acts: an optimum goes on being optimal
+    assert np.percentile(off, 90) < 0.1  # where the learner acts: feedback about it is linear
 
 
 @pytest.mark.parametrize("name", ["turn", "weave"])

@@ -8,10 +8,9 @@ structured prediction to no-regret online learning", 2011, with the mixture β o
 The feedback about an optimum is the derivative of the optimal force with respect to the state. It labels every state that an
 episode reaches near its optimum, and the states around it too: every batch draws new ones, whose labels differ by −K δ. This
 fits the slope of the policy together with its value, as in Czarnecki et al., "Sobolev training for neural networks" (2017).
-There are three exceptions, whose states label themselves alone. If a goal ends the episode, the derivative is that for a given
-time of arrival, which a policy does not observe. Next to an obstacle the derivative is too steep to guide more than the
-smallest changes. And if observations depend on the past, on noise or on forces that are on their way, they are not known for
-other states.
+There are three exceptions, whose states label themselves alone. If a goal ends the episode, the derivative is that for a
+given time of arrival, which a policy does not observe. Next to an obstacle, the derivative is steep and holds for small
+changes alone. If observations depend on the past, on noise or on delayed forces, they are not known for other states.
 
 Errors are divided by the cost of the episode's optimum, as in the regret. On a track the expert has access to each episode's
 robot. The learner gets observations alone.
@@ -178,8 +177,8 @@ class _Labels(Samples):
             share = rng.random((count, 1), dtype=np.float32) * self.around
             off = torch.as_tensor(share * rng.standard_normal(share.shape, dtype=np.float32))
             change = (self.gains[rows] @ off[..., None])[..., 0]
-            less = (_SMALL / change.abs().amax(1, keepdim=True).clamp(min=_SMALL)).where(known, 0.0)
-            actions = (actions - less * change).clamp(-1, 1)
+            less = _SMALL / change.abs().amax(1, keepdim=True).clamp(min=_SMALL)
+            actions = (actions - less * change).clamp(-1, 1).where(known, actions)
             observations = self.observe(states + less * off, self.constants[rows]).where(known, observations)
         return observations, actions, self.weights[rows]
 
