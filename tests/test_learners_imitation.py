@@ -28,6 +28,11 @@ TINY_DAGGER = dagger.DaggerConfig(
 )
 
 
+@pytest.fixture(autouse=True)
+def short_runs(monkeypatch):
+    monkeypatch.setattr(dagger, "_SECONDS", 1.0)
+
+
 def test_cloning_lowers_the_loss_and_comes_near_its_expert(demos):
     learner = dagger.make(make_task("stabilize"), default_params(), CLONING, 0, demos)
     losses = [learner.iterate()["loss/imitation"] for _ in range(learner.iterations)]
