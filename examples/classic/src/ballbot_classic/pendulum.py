@@ -22,7 +22,13 @@ from ballbot_gym import (
 
 _TURN = 2 * math.pi
 # of guessed swing-ups: torque, side of the first push, how many control steps it and that to the other side last, energy
-_FAMILY = ((2.0, 1.4), (1.0, -1.0), (0, 3, 6, 10, 14, 18), (0, 4, 8, 12, 16, 20), (0.0, 1.0))
+_FAMILY = (
+    (2.0, 1.7, 1.4, 1.0),
+    (1.0, -1.0),
+    (0, 2, 4, 6, 8, 10, 14, 18),
+    (0, 4, 8, 12, 16, 20),
+    (0.0, 0.5, 1.0, 1.5),
+)
 _SAME = 1e-3  # relative: guesses whose costs differ by less are the same
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
 
 _TURN = 2 * math.pi
-_SOLVED = 16  # guesses
+_SOLVED = 24  # guesses
 _WORSE = 1.25  # times the best solution: guesses that cost more lead to no better one
 _ROUNDS = 60  # changes of the case, each by a control step or so
 _CHANGES, _CLIPS = 8, 3  # of the number of turns, and intervals of clipped rates, in an episode
