@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from builders import measured
+from stable_baselines3 import PPO
 
 from ballbot_gym import BallbotEnv, files, named_robot
 from ballbot_gym.tasks import TASKS
@@ -48,6 +49,8 @@ def pages_with(language):
 @pytest.mark.parametrize("page", pages_with("python").values(), ids=pages_with("python"))
 def test_python_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    learn = PPO.learn
+    monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, min(steps, 4096), *more))
     namespace = {"__name__": "example"}
     for block in blocks(page, "python"):
         exec(compile(block, str(page), "exec", dont_inherit=True), namespace)
@@ -91,6 +94,17 @@ def test_commands_run(page, typed, monkeypatch):
         assert command[0] == "ballbot", f"{line}: how is this tested?"
         ended, printed = typed(*command[1:])
         assert ended == 0, f"{line}\n{printed}"
+
+
+def test_pages_show_the_same_plain_ppo_and_the_example_has_its_settings():
+    shown = {block for page in PAGES for block in blocks(page, "python") if "class LessNoise" in block}
+    assert len(shown) == 1
+    pages = [page.name for page in PAGES if shown & set(blocks(page, "python"))]
+    assert pages == ["README.md", "clients.md", "start.md"]
+    settings = re.findall(r"\b(\w+)=([\w.]+),", shown.pop())
+    example = (ROOT / "examples" / "plain_ppo.py").read_text()
+    assert {name for name, _ in settings} >= {"n_steps", "batch_size", "n_epochs", "gae_lambda", "max_grad_norm"}
+    assert [name for name, value in settings if name != "seed" and f"{name}={value}" not in example] == []
 
 
 def test_no_block_is_of_a_kind_that_nothing_runs():
