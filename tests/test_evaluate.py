@@ -185,7 +185,7 @@ IMPORTS = [
     ("import ballbot_train.evaluation.runner, ballbot_train.evaluation.comparison", []),
     ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
     ("from ballbot_train import evaluate, shipped_policies", []),
-    ("evaluate(Idle(), 'stabilize', 1, 'rk4')", []),
+    ("evaluate(Idle(), 'stabilize', 1, 'rk4')", ["casadi"]),  # it prints the C of the environment
     ("import ballbot_train.learning.demonstrations", ["casadi", "scipy"]),
 ]
 

@@ -53,7 +53,7 @@ class DaggerConfig(Settings):
     """Number of iterations."""
     gathering_iterations: int = number(40, 0, MOST)
     """First of them that gather samples; 0: clone --demos."""
-    evaluations: int = number(5, 1, MOST)
+    evaluations: int = number(10, 1, MOST)
     """Evaluations, at equal distances."""
     episodes_per_iteration: int = number(512, 1, MOST)
     """Episodes of a gathering iteration, of two optima each."""
@@ -77,6 +77,7 @@ TUNED: dict[str, DaggerConfig] = {
     "stabilize": DaggerConfig(
         iterations=20,
         gathering_iterations=2,
+        evaluations=5,
         gradient_steps=400,
         batch_size=256,
         learning_rate=1e-2,
