@@ -203,13 +203,12 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._page: Viewer | None = None
         self._now: StepState | None = None  # until the first reset
         self.params = robot_of(task, robot, params)
-        physics = checked_physics(physics, self.params)
+        self.physics = physics = checked_physics(physics, self.params)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         if render_mode == "human":
             need_library()
         self.task = make_task(task, self.params, **task_fields)
-        self.physics = physics
         self.render_mode = render_mode
         modes, fps = ["human", "rgb_array"] if can_show() else ["rgb_array"], round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
@@ -226,18 +225,14 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._contact = self._engine and self.params.CONTACT and self.params.grips
         self._simulator = make_simulator(physics, self.params, dt, physics_dt)
         self._substeps = self._simulator.substeps if isinstance(self._simulator, Rk4Simulator) else 0
+        self._senses = self.observation == "sensors"
         self.step_problem = StepProblem(
-            self.task,
-            self.params.kind,
-            self.randomization,
-            self.observation == "sensors",
-            self._substeps,
-            self._contact,
+            self.task, self.params.kind, self.randomization, self._senses, self._substeps, self._contact
         )
         self._code: StepCode | None = None
         self._constants, self._measured = np.zeros(0), tuple(each.name for each in self.params.MEASUREMENTS)
         # read in every step
-        self._senses, self._varies = self.observation == "sensors", self.randomization.varies_episodes
+        self._varies = self.randomization.varies_episodes
         self._draws = Draws(
             (0.0,) * (Randomization.PUSH_DRAWS * self.randomization.pushes),
             (0.0,) * (sensors.DRAWS * self._senses),

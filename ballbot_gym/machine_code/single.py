@@ -198,9 +198,9 @@ def step_code(problem: StepProblem, robot: Robot) -> StepCode | None:
             _functions[problem] = None
             _functions[problem] = _function(problem, robot)
         function = _functions[problem]
-    except TypeError:  # a task that has no hash
-        return None
-    except Exception as error:  # no compiler, cache or CasADi, or any error of users' code that gets a symbol
+    except (
+        Exception
+    ) as error:  # no compiler, cache, CasADi or hash of the task, or any error of users' code given a symbol
         _log.info("%s stays in Python: %s: %s", problem.task.id, type(error).__name__, error)
         return None
     return None if function is None else StepCode(problem, function)

@@ -29,6 +29,11 @@ class Reference:
     u: np.ndarray
     closed: bool = False
 
+    @property
+    def is_point(self) -> bool:
+        """Whether it is a single point."""
+        return len(self.x) == 1
+
 
 @dataclass(frozen=True)
 class Task(ABC):

@@ -147,7 +147,12 @@ class _Batch:
 
     @cached_property
     def _ends_at_a_point(self) -> bool:
-        return len(self._task.reference(self._x0[0], self._c[0], self._params).x) == 1
+        return self._task.reference(self._x0[0], self._c[0], self._params).is_point
+
+    @cached_property
+    def _guessed_paths(self) -> list[list[np.ndarray]]:
+        """The task's guessed paths of each episode."""
+        return [self._task.guess_paths(x0, c, self._params) for x0, c in zip(self._x0, self._c, strict=True)]
 
     @cached_property
     def _obstacles(self) -> list[np.ndarray]:
@@ -366,7 +371,7 @@ class _Batch:
         """The index of the episode of each guessed path, and the paths."""
         of, paths = [], []
         for i in rows.tolist():
-            some = self._task.guess_paths(self._x0[i], self._c[i], self._params)[:CONSIDERED]
+            some = self._guessed_paths[i][:CONSIDERED]
             of += [i] * len(some)
             paths += some
         return of, paths
@@ -516,7 +521,7 @@ class _Batch:
         """(J,) costs along a random detour of each of some episodes, of its best known motion or of a guessed path."""
         task, paths = self._task, []
         for i in of.tolist():
-            bases = task.guess_paths(self._x0[i], self._c[i], self._params)
+            bases = self._guessed_paths[i]
             if i in self._known and rngs[i].uniform() < 0.5:
                 bases = [self._known[i].path]
             paths.append(random_guesses.detour(bases[rngs[i].integers(len(bases))], rngs[i], task.first_exit))

@@ -126,7 +126,7 @@ def _rest(task: Task, params: Robot) -> _Rest | None:
     found: list[_Rest] = []
     for x0, c in (task.sample(np.random.default_rng(seed), params) for seed in range(2 if task.constant_names else 1)):
         end = task.reference(x0, c, params)
-        if len(end.x) > 1 or not is_equilibrium(params, end.x[0], end.u[0]):
+        if not end.is_point or not is_equilibrium(params, end.x[0], end.u[0]):
             return None
         try:
             found.append(_Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))

@@ -164,4 +164,4 @@ def steering(
 
 def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: Any) -> bool:
     """Whether the task ends at a point of rest."""
-    return not task.first_exit and len(task.reference(x0, c, params).x) == 1
+    return not task.first_exit and task.reference(x0, c, params).is_point

@@ -111,11 +111,6 @@ _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
 
 
-def _rests(task: Task, params: Robot) -> bool:
-    """Whether the task's reference is one point."""
-    return len(task.reference(*task.sample(np.random.default_rng(0), params), params).x) == 1
-
-
 @dataclass(frozen=True)
 class _Optima:
     """Optima of B episodes of at most n control steps as arrays.
@@ -209,7 +204,8 @@ class Dagger:
         torch.manual_seed(seed)
         varied = self._randomization
         present = not (history or varied.varies_actuator or varied.is_noisy)
-        self._around = present and not task.first_exit and task.routed_frame is None and _rests(task, params)
+        reference = task.reference(*task.sample(np.random.default_rng(0), params), params)
+        self._around = present and not task.first_exit and task.routed_frame is None and reference.is_point
         """Whether samples label the states around them too; see the top of this file."""
         # slopes are fitted best by smooth layers that are not bounded
         self.network = actor_for(task, params, config, history, False, start, "silu" if self._around else "tanh")
