@@ -6,6 +6,7 @@ import json
 import shlex
 import subprocess
 import sys
+from importlib import metadata
 
 import numpy as np
 import pytest
@@ -159,7 +160,7 @@ def test_only_the_command_that_is_called_is_imported():
     [
         ([], 2, "usage: ballbot COMMAND"),
         (["-h"], 0, "usage: ballbot COMMAND"),
-        (["--version"], 0, "ballbot 0."),
+        (["--version"], 0, f"ballbot {metadata.version('ballbot-gym')}"),
         (["trian"], 2, "no command 'trian'; did you mean train?"),
         (["[red]x"], 2, "no command '[red]x'; the commands are benchmark, evaluate, compare"),
         (["compare"], 2, "ballbot compare"),

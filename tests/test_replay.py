@@ -131,6 +131,15 @@ def test_the_command_films_a_trajectory_file(tmp_path):
         assert len(list(reader.iter_data())) == 5  # of 0.2 s, in slow motion
 
 
+@pytest.fixture
+def interruptible():
+    """Shells have what runs in the background ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_film_that_is_stopped_leaves_no_file(number, tmp_path, monkeypatch, capsys):
     """A command ends so on Ctrl-C, and on SIGTERM, as schedulers and `timeout` send it."""
