@@ -1,4 +1,4 @@
-"""Plain PPO of Stable-Baselines3 that learns Stabilize in five minutes: python examples/plain_ppo.py
+"""Plain PPO of Stable-Baselines3 on Stabilize, five minutes of one core: python examples/plain_ppo.py
 
 The policy's features are the observation o and tanh(20 o), in which small errors are large. Without them the robot comes to
 rest near the goal, but not in it. The standard deviation of the actions falls on a schedule, because a learned one falls long
