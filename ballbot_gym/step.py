@@ -65,7 +65,7 @@ def outcome(
     """
     running = task.cost(before, force, task.at(c, (steps - 1) * task.control_dt)) * task.control_dt
     c = task.at(c, steps * task.control_dt)
-    violated = first_violated((*task.limits(end, c), *grip))
+    violated = first_violated((*task.limits(end, c), *grip), like=end)
     failure, last = violated >= 0, steps >= task.steps
     reached = ops.full_like(violated, 1.0)
     for excess in task.goal(end, c):
@@ -284,11 +284,12 @@ def observe(task: Task, robot: Any, variation: Randomization, state: StepState, 
     return ops.components(task.seen(x, c, robot))
 
 
-def first_violated(limits: tuple[Any, ...]) -> Any:
-    """Index of the first limit that is not ≥ 0, so of NaN too; −1 where all are, or where there is none."""
-    if not limits:
-        return -1.0
-    violated = ops.full_like(limits[0], -1.0)
+def first_violated(limits: tuple[Any, ...], like: Vector) -> Any:
+    """Index of the first limit that is not ≥ 0, so of NaN too; −1 where all are, or where there is none.
+
+    It has the shape and the kind of the components of `like`, a state.
+    """
+    violated = ops.full_like(ops.components(like)[0], -1.0)
     for i in reversed(range(len(limits))):
         violated = ops.where(limits[i] >= 0, violated, float(i))
     return violated

@@ -152,9 +152,9 @@ class Trajectory(Moving):
             return self.u[-1].copy()
         return self.u[i] + fraction * (self.u[i + 1] - self.u[i])
 
-    def path_until(self, t: float) -> np.ndarray:
-        """(n, 2) the ground path of a ballbot until time t, m."""
-        return np.concatenate([self.x[self.t < t, :2], self.state(t)[None, :2]])
+    def states_until(self, t: float) -> np.ndarray:
+        """(n, 8) the states until time t."""
+        return np.concatenate([self.x[self.t < t], self.state(t)[None]])
 
     def _locate(self, t: float) -> tuple[int, float]:
         """The interval that contains t, and the fraction of it before t; (N, 0) at the end."""

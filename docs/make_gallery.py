@@ -117,7 +117,7 @@ def drawing(replay: Replay, optimum: Trajectory, t: float) -> Drawing:
     """A moment, s, with the optimum as a ghost."""
     drawn = replay.drawing(replay.takes[0], t)
     ghost = Drawn(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY)
-    path = GroundPath(optimum.path_until(t), labels.OPTIMUM, True)
+    path = GroundPath(optimum.states_until(t)[:, :2], labels.OPTIMUM, True)
     return replace(drawn, robots=(ghost, *drawn.robots), paths=(*drawn.paths, path))
 
 

@@ -8,16 +8,19 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 import ballbot_baselines
 import ballbot_gym
 import ballbot_train
-from ballbot_baselines import VARIANTS, find_optimum
+from ballbot_baselines import VARIANTS, find_optimum, regret
 from ballbot_baselines.solvers.shooting import Backoff, Shooting
-from ballbot_gym import TASKS, BallbotEnv, named_robot, rollout
+from ballbot_gym import TASKS, BallbotBatch, BallbotEnv, named_robot, rollout
 from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.robot import ROBOTS
 from ballbot_train import RegretWrapper, evaluate
+from ballbot_train.report.film import film_frames
+from ballbot_train.report.replay import Replay, Take
 
 FOLDER = Path(__file__).parent.parent / "examples" / "classic" / "src"
 COUNTERPARTS = ("pendulum",)
@@ -168,6 +171,20 @@ def test_the_wrapper_takes_own_environments_and_many_at_once(own_cache):
     assert infos["regret"][0] == pytest.approx(info["regret"], rel=1e-5)
     with pytest.raises(ValueError, match="unknown task 'Acrobot-v1'"):
         RegretWrapper(gymnasium.make("Acrobot-v1"))
+
+
+def test_a_system_without_limits_or_position_is_measured_batched_and_drawn(classic):
+    optimum, task, robot = optimum_of_seed("pendulum", 1), make_task("pendulum"), named_robot("pendulum")
+    found = regret(optimum.trajectory, task, robot)
+    assert (found.violated, found.success) == ("", True)
+    assert found.regret == pytest.approx(0, abs=1e-9)
+    assert np.abs(found.defects).max() < 1e-9
+    batch = BallbotBatch("pendulum", 2, compile=False)
+    batch.reset(seed=0)
+    assert batch.step(torch.zeros(2, 1)).violated.tolist() == [-1, -1]
+    replay = Replay("", (Take("", optimum.trajectory, "#000000"),), params=robot)
+    frames = list(film_frames(replay, [0.0, 1.0], 128))
+    assert (frames[0] != frames[1]).any()
 
 
 def test_kellys_cart_pole_ends_upright_with_the_least_effort():

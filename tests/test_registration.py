@@ -248,33 +248,78 @@ def test_a_goal_that_cannot_be_reached_names_the_methods_to_look_at(monkeypatch)
         optima.known(far(duration=0.4), "paper", [0])
 
 
+FEW = ("--iterations", 1, "--evaluations", 1, "--num-envs", 4, "--batch-size", 96)
+FEW += ("--test-episodes", 1, "--validation-episodes", 1)
+"""Options of a training that only has to run."""
+
+
+def check_package(folder):
+    """The tests of a package pass, and ruff finds no fault in it."""
+    for check in ("pytest -q", "ruff check .", "ruff format --check ."):
+        ran = subprocess.run([sys.executable, "-m", *check.split()], cwd=folder, capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stdout
+
+
+def entries_of(folder):
+    """The tasks that a package announces, by name."""
+    return tomllib.loads((folder / "pyproject.toml").read_text())["project"]["entry-points"]["ballbot_gym.tasks"]
+
+
 def test_a_new_package_passes_its_own_tests(typed, tmp_path):
     ended, printed = typed("new", "task", "figure_eight", "--episodes", 1)
     assert ended == 0, printed
     folder = tmp_path / "figure_eight"
     assert "| figure_eight | trajopt | bullet | 100.0 % | 0/1 |" in (folder / "leaderboard.md").read_text()
-    entry = tomllib.loads((folder / "pyproject.toml").read_text())["project"]["entry-points"]["ballbot_gym.tasks"]
-    assert entry == {"figure_eight": "ballbot_figure_eight:FigureEight"}
-    ran = subprocess.run([sys.executable, "-m", "pytest", "-q"], cwd=folder, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout
-    for check in ("check", "format --check"):
-        ran = subprocess.run(
-            [sys.executable, "-m", "ruff", *check.split(), "."], cwd=folder, capture_output=True, text=True
-        )
-        assert ran.returncode == 0, ran.stdout
+    assert entries_of(folder) == {"figure_eight": "ballbot_figure_eight:FigureEight"}
+    check_package(folder)
     assert typed("new", "task", "figure_eight")[0] == 1
 
 
+def test_a_new_system_passes_its_own_tests(typed, tmp_path):
+    ended, printed = typed("new", "system", "two_springs", "--episodes", 1)
+    assert ended == 0, printed
+    folder = tmp_path / "two_springs"
+    assert "| two_springs | trajopt | rk4 | 100.0 % | 0/1 |" in (folder / "leaderboard.md").read_text()
+    assert "ballbot play" not in (folder / "README.md").read_text()
+    assert entries_of(folder) == {"two_springs": "ballbot_two_springs:TwoSpringsTask"}
+    check_package(folder)
+    assert typed("new", "system", "two_springs", "--out", "again")[0] == 1
+
+
+@pytest.mark.slow
+def test_commands_take_a_new_system(typed, tmp_path, monkeypatch):
+    assert typed("new", "system", "two_rails", "--episodes", 0)[0] == 0
+    monkeypatch.syspath_prepend(tmp_path / "two_rails")
+    name = "ballbot_two_rails:two_rails"
+    for command in (
+        ("optimize", name),
+        ("benchmark", "--tasks", name, "--controllers", "nmpc", "--episodes", 1),
+        ("evaluate", "lqr", "--task", name, "--episodes", 1),
+        ("replay", name, "--controllers", "lqr", "--frames", 1),
+        ("demos", "--task", name, "--expert", "lqr", "--episodes", 1),
+        ("train", "ppo", "--task", name, *FEW),
+    ):
+        ended, printed = typed(*command)
+        assert ended == 0, f"{command[0]}: {printed}"
+    ended, printed = typed("play", name)
+    assert (ended, "the page draws ballbots" in printed) == (1, True)
+
+
+@pytest.mark.parametrize("kind", ["task", "system"])
 @pytest.mark.parametrize("name", ["turn", "My Task", "../x"])
-def test_a_new_package_needs_a_name_of_its_own(name, typed, tmp_path):
-    assert typed("new", "task", name)[0] == 1
+def test_a_new_package_needs_a_name_of_its_own(kind, name, typed, tmp_path):
+    assert typed("new", kind, name)[0] == 1
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["none", "true", "reference", "any", "value_error", "gym", "turn_"])
-def test_a_new_package_has_a_class_and_a_module_that_nothing_else_has(name, typed, tmp_path):
-    ended, printed = typed("new", "task", name)
-    assert (ended, "give another name" in printed) == (1, True)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("task", name) for name in ("none", "true", "reference", "any", "value_error", "gym", "turn_")]
+    + [("system", name) for name in ("none", "true", "quantity", "robot", "task", "gym", "kugle")],
+)
+def test_a_new_package_has_a_class_and_a_module_that_nothing_else_has(kind, name, typed, tmp_path):
+    ended, printed = typed("new", kind, name)
+    assert (ended, "give another name" in printed) == (1, True), printed
     assert not any(tmp_path.iterdir())
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageColor, ImageDraw
 
 from ballbot_gym.drawing import Drawing, Drawn, GroundPath, arrows, pose
-from ballbot_gym.robot import Robot, Sphere
+from ballbot_gym.robot import Ballbot, Robot, Sphere
 from ballbot_gym.tasks.marker import Marker
 
 YAW = math.radians(-55)
@@ -186,8 +186,10 @@ def _robot(params: Robot, robot: Drawn) -> list[_Solid]:
 
 
 def _arrows(params: Any, robot: Drawn) -> list[_Solid]:
-    """Those of a robot's force and push."""
+    """Those of a ballbot's force and push."""
     solids = []
+    if not isinstance(params, Ballbot):
+        return solids
     for color, (start, end) in arrows(pose(params, robot.x), robot):
         neck = end - min(_HEAD_LENGTH / float(np.linalg.norm(end - start)), 0.9) * (end - start)
         solids += [(_placed(_CYLINDER, start, neck, _ARROW), color), (_placed(_CONE, neck, end, _HEAD), color)]

@@ -37,7 +37,7 @@ class BatchState(NamedTuple):
 
 def _check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:
     """Raises a ValueError if states in 8 rows (B,) violate a limit of the task where the mask holds."""
-    violated = first_violated(task.limits(x, task.at(c, 0 * x[0])))
+    violated = first_violated(task.limits(x, task.at(c, 0 * x[0])), like=x)
     bad = [i for i, is_bad in enumerate((mask & (violated >= 0)).tolist()) if is_bad]
     if bad:
         raise ValueError(

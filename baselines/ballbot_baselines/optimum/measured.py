@@ -8,8 +8,8 @@ import numpy as np
 from ballbot_baselines.optimum.find import find_optimum
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_gym.checks import finite_array
-from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, Robot, checked_robot, substeps_for
+from ballbot_gym.env import make_task, robot_of
+from ballbot_gym.robot import PAPER, Robot
 from ballbot_gym.step import limit_names, outcome
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -59,7 +59,7 @@ def regret(
             in `Ballbot.STATE`; u (N, 2) N, each held until the next time, or (N+1, 2), linear between times. It may begin
             at any time, and continue after the episode's end.
         task: a name in `TASKS`, or any Task.
-        robot: a name in `ROBOTS`, or any Robot.
+        robot: a name in `ROBOTS`, or any Robot; default, the robot that the task names.
         constants: (nc,) of the episode, named in the task's `constant_names`.
 
     Raises:
@@ -67,7 +67,7 @@ def regret(
             TrajectoryError) the arrays do not fit together.
         PlanError: no optimum is found from its first state.
     """
-    params = checked_robot(robot)
+    params = robot_of(task, robot)
     task = make_task(task, params)
     moved = trajectory if isinstance(trajectory, Trajectory) else Trajectory(*trajectory)
     if len(moved.t) < 2:
@@ -132,7 +132,7 @@ def _cost(task: Task, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> float:
 def _defects(params: Robot, moved: Trajectory) -> np.ndarray:
     """(N, 8) recorded states less those that the equations make of the ones before."""
     dt, x = np.diff(moved.t), moved.x[:-1]
-    parts = substeps_for(dt.max()) * (1 if moved.held else _LINEAR_STEPS)
+    parts = params.substeps(dt.max()) * (1 if moved.held or params.DISCRETE else _LINEAR_STEPS)
     for i in range(parts):
         share = (i + 0.5) / parts
         force = moved.u if moved.held else (1 - share) * moved.u[:-1] + share * moved.u[1:]

@@ -8,6 +8,7 @@ import numpy as np
 from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
+from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, checked_randomization, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
@@ -42,7 +43,7 @@ def certify(
             memory. See `ballbot_train.work.shards`.
         out: folder of the .npz files.
         workers: who does the work.
-        robot: name of the robot.
+        robot: name of the robot; default, the robot that each task names.
         randomization: name of the track that each episode's robot and delay are drawn from; default, none.
     """
     check_names("task", tasks, TASKS, least=1)
@@ -56,9 +57,10 @@ def certify(
         _certify_shards(tasks, episodes, shards, out, workers, robot)
         return
     jobs.make_folder(out)
-    params, failures = named_robot(robot), []
+    failures = []
     for name in tasks:
-        task = make_task(name, robot)
+        of = own_robot(name, robot)
+        task, params = make_task(name, of), named_robot(of)
         try:
             optima.compute(task, params, range(episodes), workers, varied)
         except PlanError as error:
@@ -66,8 +68,8 @@ def certify(
             continue
         found = certified.from_cache(task, params, range(episodes), varied)
         assert found is not None
-        name = certified.path_of(task, robot, randomization or "").name
-        path = found.first(episodes).save(task, out / name, robot, varied)
+        name = certified.path_of(task, of, randomization or "").name
+        path = found.first(episodes).save(task, out / name, of, varied)
         console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failures:
         raise PlanError("\n".join(failures))
@@ -77,13 +79,14 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
     from ballbot_train.work.shards import make
 
     for name in tasks:
+        of = own_robot(name, robot)
         about = {
-            "certified": make_task(name, robot).problem(),
+            "certified": make_task(name, of).problem(),
             "version": provenance()["version"],
-            "problem": certified.named_problem(name, robot),
-            **robot_setting(robot),
+            "problem": certified.named_problem(name, of),
+            **robot_setting(of),
         }
-        set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, robot)
+        set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, of)
         made = make(set_url, about, episodes, function, out / name, workers, name)
         console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")
 

@@ -14,7 +14,7 @@ from ballbot_train.work.executors import Workers
 
 
 def demos(
-    config: Annotated[DemoConfig, UNNAMED] = DemoConfig(),
+    config: Annotated[DemoConfig, UNNAMED],
     shards: str | None = None,
     out: Path | None = None,
     workers: WorkersOption = Workers(),

@@ -8,6 +8,7 @@ from typing import Any
 
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Randomization, checked_randomization, file_name, track_of
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.options import Filter, WorkersOption
@@ -64,11 +65,12 @@ def evaluate(
             later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
         workers: who runs certified episodes, and finds optima.
-        robot: whose episodes.
+        robot: whose episodes; default, the robot that the task names.
         randomization: name of the track on which the episodes are, of robots and delays that are hidden from the policy.
         filter: in front of the policy: it acts on what this estimates of the robot, the delay or, of sensors, the state.
     """
     varied = checked_randomization(randomization)
+    robot = robot if task is None else own_robot(task, robot)
     task, policy = task_name(policy, task, robot), behind(policy, filter)
     chosen = controllers_of([task], [policy], [robot])
     check_least(0, optima=optima or 0)

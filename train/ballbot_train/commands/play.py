@@ -5,7 +5,8 @@ from typing import Literal
 
 from ballbot_gym.drawing.viewer import PORT, Viewer, need_library
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER
+from ballbot_gym.registry import own_robot
+from ballbot_gym.robot import PAPER, Ballbot, named_robot
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.report.live_page import PlayPage
 from ballbot_train.report.simulation import Playground, Start
@@ -40,6 +41,12 @@ def play(
         randomization: name of a track, as "unknown": every episode has a robot of it, which is hidden from the controllers.
     """
     task = task_name(controller or "", task, robot)
+    robot = own_robot(task, robot)
+    if not isinstance(params := named_robot(robot), Ballbot):
+        raise ValueError(
+            f"the page draws ballbots, and {task} is a task of a {type(params).__name__}; to see its episodes: "
+            f"ballbot replay {task} --controllers NAME"
+        )
     need_library()
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_gym.engines import default_physics
+from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter
@@ -50,7 +51,7 @@ def replay(
         speed: seconds of the episode per second of film; 0.5 is slow motion.
         width: width of a film, px; default 1280 for mp4, 640 for webp.
         out: folder of the file. The file is named after task, controllers and episode.
-        robot: whose episode; a trajectory file is drawn with the paper's.
+        robot: whose episode; default, the robot that the task names; a trajectory file is drawn with the paper's.
         frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of
             them. Where the ball slips, its path is red.
         filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
@@ -60,7 +61,6 @@ def replay(
     _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
-    physics = physics_or_default(physics, robot)
     if all(Path(entry).suffix == ".npz" for entry in source):
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
@@ -69,6 +69,8 @@ def replay(
     else:
         _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
         check_names("task", source, TASKS)
+        robot = own_robot(source[0], robot)
+        physics = physics_or_default(physics, robot)
         _check(bool(controllers), "give at least one controller")
         controllers = tuple(behind(name, filter) for name in controllers)
         shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)

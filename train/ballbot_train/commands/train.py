@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, cast
 
 from ballbot_gym import certified
+from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, checked_randomization, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import UNNAMED
@@ -37,7 +38,7 @@ class Run(Settings):
     resume: bool = False
     """Continue the run in this folder."""
     robot: RobotName = PAPER
-    """Name of a robot."""
+    """Name of a robot; default, the robot that the task names."""
     demos: str | None = None
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Path | None = None
@@ -72,6 +73,7 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
     """
     _check_learner(learner)
     check_names("task", [run.task], TASKS)
+    run = replace(run, robot=own_robot(run.task, run.robot))
     run.check()
     if run.out is None:
         run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")

@@ -25,7 +25,7 @@ import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -42,7 +42,8 @@ from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import certified, files, seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robot import PAPER, Robot
+from ballbot_gym.registry import own_robot
+from ballbot_gym.robot import PAPER, Robot, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import controllers
@@ -66,8 +67,8 @@ class DemoConfig:
     """Name of a controller, as trajopt (a plan, tracked by TVLQR), nmpc or lqr, or of a shipped policy."""
     episodes: int = 200
     """Number of episodes."""
-    physics: Literal["bullet", "mujoco", "rk4"] = field(default_factory=lambda: cast(Any, default_physics()))
-    """Simulator; default, the first that is installed."""
+    physics: Literal["bullet", "mujoco", "rk4"] | None = None
+    """Simulator; default, the first that is installed and simulates the robot."""
     noise: float = 0.05
     """Exploration: each episode draws the standard deviation of its noise from [0, this], in units of the force limit."""
     pushes: float = 0.5
@@ -77,10 +78,13 @@ class DemoConfig:
     seed: int = 0
     """Seed of the dataset."""
     robot: str = PAPER
-    """Name of a robot in `ROBOTS`."""
+    """Name of a robot in `ROBOTS`; default, the robot that the task names."""
 
     def __post_init__(self) -> None:
-        check_installed(self.physics)
+        object.__setattr__(self, "robot", own_robot(self.task, self.robot))
+        if self.physics is None:
+            object.__setattr__(self, "physics", default_physics(named_robot(self.robot)))
+        check_installed(cast(str, self.physics))
         task = make_task(self.task, self.robot)
         check_names("expert", [self.expert], controllers.names(task, self.robot))
         if not 1 <= self.episodes <= _MOST_EPISODES:

@@ -14,7 +14,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ballbot_gym import files
 from ballbot_gym.drawing.picture import picture
-from ballbot_gym.robot import tilt as tilt_of
 from ballbot_train.report.replay import LEAST_SLIP, Replay
 
 Format = Literal["png", "mp4", "webp"]
@@ -88,8 +87,9 @@ def _frame(replay: Replay, t: float, width: int, height: int, line: int, columns
         shown = picture(replay.drawing(take, t), max(right - left, 1), max(bottom - top, 1))
         frame.paste(Image.fromarray(shown), (left, top))
         label, slip = textwrap.fill(take.label, letters), take.slip_at(t)
-        lean = math.degrees(tilt_of(take.trajectory.state(t)))
-        tilt = f"{lean:.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
+        measured = replay.params.measurements(take.trajectory.state(t))
+        lean = replay.params.named_measurements(measured).get("tilt")
+        tilt = ("" if lean is None else f"{math.degrees(lean):.0f}°") + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
         pen.text((left + 3, top + 2), label, take.color, font)
         pen.text((left + 3, top + 3 * line // 2 * (1 + label.count("\n"))), tilt, take.color, large)
         if t >= take.trajectory.duration or not take.failed:

@@ -86,7 +86,8 @@ class Replay:
         if take.slip is not None:
             slips = np.flatnonzero((take.slip > LEAST_SLIP) & (driven.t[1:] <= t))
             skids = (GroundPath(driven.x[i : i + 2, :2], SKID) for i in slips)
-        paths = GroundPath(driven.path_until(t), take.color), *skids
+        places = np.array([self.params.position(x) for x in driven.states_until(t)])
+        paths = GroundPath(places, take.color), *skids
         return Drawing(self.params, (Drawn(take.trajectory.state(t), take.color, u),), paths, self.markers)
 
 
