@@ -56,6 +56,8 @@ MODELS = {
     "ppo": lambda: PPO("MlpPolicy", envs(), device="cpu"),
     "relu": lambda: PPO("MlpPolicy", envs(), policy_kwargs={"net_arch": [7, 5], "activation_fn": torch.nn.ReLU}),
     "sac": lambda: SAC("MlpPolicy", envs(), buffer_size=10, device="cpu"),
+    "ppo with gSDE": lambda: PPO("MlpPolicy", envs(), use_sde=True, device="cpu"),
+    "sac with gSDE": lambda: SAC("MlpPolicy", envs(), buffer_size=10, use_sde=True, device="cpu"),
     "td3": lambda: TD3("MlpPolicy", envs(), buffer_size=10, policy_kwargs={"net_arch": [6]}, device="cpu"),
 }
 
@@ -207,7 +209,7 @@ def with_weights(**changes):
         (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}, which is not read"),
         (lambda members: members.pop("data"), "it holds no data"),
         (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
-        (with_data(use_sde=True), "exploration by its state"),
+        (with_data(policy_kwargs={"squash_output": True}), "squashed by tanh"),
         (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
         (with_data(policy_kwargs={"features_extractor_class": "x"}), "a network that extracts features"),
         (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation <class 'Mish"),

@@ -36,7 +36,7 @@ class RegretWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     | regret | cost / cost of the optimum − 1, as everywhere in this package, where return + cost is `Task.survival_pay` |
 
     The optima of starts that are not in the certified set are computed at the end of the episode, which takes from
-    milliseconds to a second, and are kept in the user's cache. An episode for which no optimum is found has none of the keys.
+    milliseconds to a second, and are kept in the user's cache. Where no optimum is found, the values are NaN.
     """
 
     def __init__(self, env: gymnasium.Env, task: str | Task | None = None):
@@ -76,10 +76,9 @@ class RegretWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         if (terminated or truncated) and self._start is not None:
             start = (np.asarray(part, np.float64).tobytes() for part in self._start)
             cost = _optimal_cost(self._task, self._robot, *start)
-            if np.isfinite(cost):
-                best = self._task.survival_pay - cost
-                gap = best - self._return
-                info = {**info, "optimum": best, "gap": gap, "regret": gap / cost}
+            best = self._task.survival_pay - cost
+            gap = best - self._return
+            info = {**info, "optimum": best, "gap": gap, "regret": gap / cost}
         return observation, reward, terminated, truncated, info
 
 

@@ -1,11 +1,12 @@
 """Saved models of Stable-Baselines3 as policies: their weights alone are read, and nothing in them is executed.
 
 Of MODEL.zip, as `model.save` writes it, `policy.pth` is read as tensors, and of `data` plain JSON values. These are PPO, A2C,
-SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO. Pickles, such as `VecNormalize.save` writes, can execute
-code, and are not read.
+SAC, TD3 and DDPG with MlpPolicy, with or without exploration by the state (use_sde), and of sb3_contrib TQC and TRPO.
+Pickles, such as `VecNormalize.save` writes, can execute code, and are not read.
 """
 
 import itertools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,6 +43,8 @@ class _Saved(NamedTuple):
     """Between them, a name in `torch.nn`."""
     squashed: bool
     """Whether the output is, by tanh."""
+    most: float
+    """What the output is clipped to, in size, before it is squashed."""
     observation_space: spaces.Box | str
     action_space: spaces.Box | str
     """What it was trained on: a Box, or the name of a space of another kind."""
@@ -55,18 +58,23 @@ class _Saved(NamedTuple):
 class _SavedActor(torch.nn.Module):
     """Runs a network, and brings its output into [−1, 1]."""
 
-    def __init__(self, network: torch.nn.Module, squashed: bool, history: int = 0, unit: Any = 1.0):
+    def __init__(
+        self, network: torch.nn.Module, squashed: bool, history: int = 0, unit: Any = 1.0, most: float = math.inf
+    ):
         """Args: squashed: whether the output is, by tanh; else it is clipped. history: as that of its env. unit: the largest
-        action of its env.
+        action of its env. most: see `_Saved`.
         """
         super().__init__()
+        self._most = most
         self.history = history
         self.register_buffer("unit", torch.as_tensor(unit, dtype=torch.float32))
         self.network, self._squashed = network, squashed
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         action = self.network(observation)
-        return torch.tanh(action) if self._squashed else (action / self.unit).clamp(-1.0, 1.0)
+        if self._squashed:
+            return torch.tanh(action.clamp(-self._most, self._most))
+        return (action / self.unit).clamp(-1.0, 1.0)
 
 
 def mark(space: spaces.Space, task: Task, params: Robot) -> None:
@@ -188,7 +196,8 @@ def load_actor(
     network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
     for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-    return _SavedActor(network, model.squashed, history, counterpart[1].high if counterpart else 1.0).eval()
+    unit = counterpart[1].high if counterpart else 1.0
+    return _SavedActor(network, model.squashed, history, unit, model.most).eval()
 
 
 def _size(model: _Saved, task: Task, params: Robot) -> int:
@@ -225,7 +234,7 @@ def _read_zip(path: Path) -> _Saved:
     unread = {
         f"a policy of {made_by or 'an unknown module':.100}": not made_by.startswith(_MODULES),
         "a network that extracts features": extracts,
-        "exploration by its state (use_sde)": data.get("use_sde"),
+        "an output that is squashed by tanh (squash_output)": begins == _ON_POLICY and options.get("squash_output"),
         # only on-policy algorithms leave this empty where there was no VecNormalize
         "statistics of VecNormalize": "gae_lambda" in data and data.get("_last_original_obs") is not None,
         f"the activation {activation:.100}": activation not in _ACTIVATIONS,
@@ -237,7 +246,9 @@ def _read_zip(path: Path) -> _Saved:
             "and give it to ballbot_train.evaluate"
         )
     found = (_space(data[name]) for name in ("observation_space", "action_space"))
-    return _Saved(_layers(path, weights, *begins), activation, usual == "ReLU", *found)
+    # where off-policy algorithms explore by the state, they bound the mean action, see SB3's `Actor`
+    bound = float(options.get("clip_mean", 2.0)) if data.get("use_sde") and begins == _OFF_POLICY else 0.0
+    return _Saved(_layers(path, weights, *begins), activation, usual == "ReLU", bound or math.inf, *found)
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:
