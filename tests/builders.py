@@ -1,11 +1,18 @@
-"""Results as an evaluation would have made them, and plain controllers, for tests of what is done with them."""
+"""Results as an evaluation would have made them, plain controllers, and the example's systems, for tests."""
 
+import sys
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
+import gymnasium
 import numpy as np
 
 from ballbot_gym.robot import ROBOTS
+from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.results import Result
+
+CLASSIC = Path(__file__).parent.parent / "examples" / "classic"
 
 _FIELDS = {
     "task": "stabilize",
@@ -73,3 +80,22 @@ def task_and_robot(policy):
     """The names of both in the name of a shipped policy, as TASK-ROBOT-LEARNER."""
     task, *others = policy.split("-")
     return task, next((robot for robot in ROBOTS if robot in others), "paper")
+
+
+@contextmanager
+def classic_systems():
+    """The package of `examples/classic`, whose tasks and robots are registered in this block alone."""
+    folder, before = str(CLASSIC / "src"), [dict(each) for each in (TASKS, ROBOTS, gymnasium.registry)]
+    sys.path.insert(0, folder)
+    try:
+        import ballbot_classic
+
+        ballbot_classic.register()
+        yield ballbot_classic
+    finally:
+        sys.path.remove(folder)
+        for held, own in zip((TASKS, ROBOTS, gymnasium.registry), before, strict=True):
+            held.clear()
+            held.update(own)
+        for name in [name for name in sys.modules if name.partition(".")[0] == "ballbot_classic"]:
+            del sys.modules[name]

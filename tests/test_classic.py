@@ -1,7 +1,6 @@
 """Gymnasium's classic systems as robots and tasks from outside of the packages, with their optima."""
 
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,40 +8,27 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from builders import classic_systems
 
 import ballbot_baselines
 import ballbot_gym
 import ballbot_train
 from ballbot_baselines import VARIANTS, find_optimum, regret
 from ballbot_baselines.solvers.shooting import Backoff, Shooting
-from ballbot_gym import TASKS, BallbotBatch, BallbotEnv, named_robot, rollout
+from ballbot_gym import BallbotBatch, BallbotEnv, named_robot, rollout
 from ballbot_gym.env import make_task, robot_of
-from ballbot_gym.robot import ROBOTS
 from ballbot_train import RegretWrapper, evaluate
 from ballbot_train.report.film import film_frames
 from ballbot_train.report.replay import Replay, Take
 
-FOLDER = Path(__file__).parent.parent / "examples" / "classic" / "src"
 COUNTERPARTS = ("pendulum",)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def classic():
     """The tasks and robots of the example, which are gone after these tests."""
-    before, robots, known = dict(TASKS), dict(ROBOTS), dict(gymnasium.registry)
-    sys.path.insert(0, str(FOLDER))
-    try:
-        import ballbot_classic
-
-        ballbot_classic.register()
-        yield ballbot_classic
-    finally:
-        sys.path.remove(str(FOLDER))
-        for held, own in ((TASKS, before), (ROBOTS, robots), (gymnasium.registry, known)):
-            held.clear()
-            held.update(own)
-        for name in [name for name in sys.modules if name.partition(".")[0] == "ballbot_classic"]:
-            del sys.modules[name]
+    with classic_systems() as package:
+        yield package
 
 
 @pytest.fixture

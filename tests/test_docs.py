@@ -7,10 +7,11 @@ import re
 import shlex
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from builders import measured
+from builders import classic_systems, measured
 from stable_baselines3 import PPO
 
 from ballbot_gym import BallbotEnv, files, named_robot
@@ -52,8 +53,9 @@ def test_python_runs(page, tmp_path, monkeypatch):
     learn = PPO.learn
     monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, min(steps, 4096), *more))
     namespace = {"__name__": "example"}
-    for block in blocks(page, "python"):
-        exec(compile(block, str(page), "exec", dont_inherit=True), namespace)
+    with classic_systems() if page.name == "classic.md" else nullcontext():
+        for block in blocks(page, "python"):
+            exec(compile(block, str(page), "exec", dont_inherit=True), namespace)
 
 
 def test_the_task_that_is_added_can_be_certified(interpreted):
