@@ -247,7 +247,9 @@ def start(
         variation: what varies.
         z: `start_draws` uniform numbers.
         senses: whether sensors are observed, and not the state.
-        x, c, drawn: state, constants and draws of the variation; drawn where they are not given.
+        x: the state; drawn where it is not given.
+        c: the constants; drawn where they are not given.
+        drawn: what the variation drew for the episode; drawn where it is not given.
     """
     z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
     if c is None:

@@ -125,7 +125,7 @@ def test_pictures_and_commands_that_pages_name_exist():
 
 def test_films_are_small_enough_to_load_at_once():
     films = sorted((ROOT / "docs" / "pictures").glob("*.webp"))
-    assert [film.stem for film in films] == ["lean", "slip"]
+    assert [film.stem for film in films] == ["lean", "playground", "slip"]
     assert max(film.stat().st_size for film in films) <= 2e6
 
 
@@ -208,7 +208,7 @@ def test_the_films_are_of_the_submissions_that_the_leaderboard_has_and_small():
     made = json.loads(make_gallery.MADE.read_text())
     for name, film in made.items():  # a row that is sent may come without films
         assert film["submission"] == films[name].submission
-        assert (make_gallery.FILMS / name).stat().st_size <= 90e3
+        assert (make_gallery.FILMS / name).stat().st_size <= 160e3
     assert {path.name for path in make_gallery.FILMS.glob("*.webp")} == set(made)
     assert make_gallery.page(made) == make_gallery.PAGE.read_text()
 

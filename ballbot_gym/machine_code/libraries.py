@@ -142,8 +142,17 @@ def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str
         return kept(built, folder, stem)
 
 
-def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, ...]) -> None:
+def compile_library(
+    compiler: str, source: str, built: Path, flags: tuple[str, ...], seconds: float | None = _COMPILE_SECONDS
+) -> None:
     """Compiles C code to the shared library `built`. The code is saved in the same folder.
+
+    Args:
+        compiler: the program.
+        source: the code.
+        built: where the library is written.
+        flags: of the compiler, besides those that every library needs.
+        seconds: after which it counts as hanging; None waits for as long as it takes.
 
     Raises:
         subprocess.CalledProcessError: the compiler refuses the code or a flag.
@@ -152,7 +161,7 @@ def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, .
     code = built.with_suffix(".c")
     code.write_text(source, encoding="utf-8")
     own = flags if _is_gcc(compiler) else without_parameters(flags)
-    _run([compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES], _COMPILE_SECONDS, check=True)
+    _run([compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES], seconds, check=True)
 
 
 def without_parameters(flags: tuple[str, ...]) -> tuple[str, ...]:
@@ -174,7 +183,7 @@ def kept(built: Path, folder: Path, stem: str) -> Path:
     return path
 
 
-def _run(command: list[str], seconds: float, check: bool) -> str:
+def _run(command: list[str], seconds: float | None, check: bool) -> str:
     """Standard output of a program; bytes that are no UTF-8 are replaced."""
     return subprocess.run(
         command, capture_output=True, encoding="utf-8", errors="replace", check=check, timeout=seconds
