@@ -22,8 +22,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
-from ballbot_gym import TASKS, files
-from ballbot_gym.env import make_task, robot_of
+from ballbot_gym import BallbotEnv, files
 from ballbot_train import evaluate
 
 AGENTS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "td3": TD3}
@@ -162,13 +161,12 @@ def acts_at_random(env: str) -> Callable[[np.ndarray], np.ndarray]:
 
 def by_hand(env: str) -> dict[str, Any]:
     """Controllers without learning, by name, that act on an environment."""
-    (name,) = (name for name, kind in TASKS.items() if kind.counterpart == env)
-    task, robot = make_task(name), robot_of(name)
     known: dict[str, Any] = {"random": acts_at_random(env), "lqr": "lqr", "nmpc": "nmpc", "optimum": "optimum"}
     if env == "Pendulum-v1":
         from ballbot_classic.pendulum import EnergyShaping
 
-        known["energy shaping"] = EnergyShaping(task, robot)
+        with BallbotEnv(env) as own:
+            known["energy shaping"] = EnergyShaping(own.task, own.params)
     return known
 
 
@@ -190,8 +188,8 @@ def measure(
         episodes: certified episodes: those of the seeds from 0.
         controllers: others to measure; default, all.
     """
-    (name,) = (name for name, kind in TASKS.items() if kind.counterpart == env)
-    pay, others = make_task(name).survival_pay, by_hand(env)
+    with BallbotEnv(env) as own:
+        pay, others = own.task.survival_pay, by_hand(env)
     entries: list[tuple[str, int | str, Any, dict[str, Any]]] = [
         (each, "", others[each], {}) for each in (others if controllers is None else controllers)
     ]

@@ -4,6 +4,7 @@ The episodes are those of the seeds from 0, recorded in the environment itself. 
 returns of random actions and of the optimum, both in these same episodes: `minari.get_normalized_score`.
 """
 
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,9 +17,7 @@ from ballbot_classic.replay import followed
 from minari.data_collector import EpisodeBuffer
 
 from ballbot_baselines import find_optimum
-from ballbot_gym.certified import EPISODES
-from ballbot_gym.certified.cache import episode
-from ballbot_gym.env import make_task, robot_of
+from ballbot_gym import BallbotEnv
 
 
 def recorded(env: gymnasium.Env, actions: Iterable[np.ndarray], seed: int) -> EpisodeBuffer:
@@ -46,10 +45,10 @@ def recorded(env: gymnasium.Env, actions: Iterable[np.ndarray], seed: int) -> Ep
 def random_return(env: gymnasium.Env, seed: int) -> float:
     """The return of random actions in the episode of a seed."""
     env.action_space.seed(seed)
-    return float(np.sum(recorded(env, iter(env.action_space.sample, None), seed).rewards))
+    return float(np.sum(recorded(env, (env.action_space.sample() for _ in itertools.count()), seed).rewards))
 
 
-def main(id: str, /, episodes: int = EPISODES, name: str | None = None) -> minari.MinariDataset:
+def main(id: str, /, episodes: int = 200, name: str | None = None) -> minari.MinariDataset:
     """Records the optimum of every episode.
 
     Args:
@@ -58,16 +57,18 @@ def main(id: str, /, episodes: int = EPISODES, name: str | None = None) -> minar
         name: of the dataset; default ENVIRONMENT/optimum-v0, such as pendulum/optimum-v0.
     """
     register()
-    task, robot = make_task(id), robot_of(id)
-    env = gymnasium.make(id)
-    optima = [find_optimum(task, robot, *episode(task, robot, seed), twice=True) for seed in range(episodes)]
+    env, optima = gymnasium.make(id), []
+    with BallbotEnv(id) as own:
+        for seed in range(episodes):
+            _, info = own.reset(seed=seed)
+            optima.append(find_optimum(own.task, own.params, info["state"], info["constants"], twice=True))
     dataset = minari.create_dataset_from_buffers(
         name or f"{id.rpartition('-')[0].lower()}/optimum-v0",
         [recorded(env, followed(id, optimum, seed), seed) for seed, optimum in enumerate(optima)],
         env,
         algorithm_name="optimum of ballbot-classic",
         ref_min_score=float(np.mean([random_return(env, seed) for seed in range(episodes)])),
-        ref_max_score=float(task.survival_pay - np.mean([optimum.cost for optimum in optima])),
+        ref_max_score=float(own.task.survival_pay - np.mean([optimum.cost for optimum in optima])),
         description=f"The best motion known in each of the first {episodes} episodes of {id}, by seed.",
         requirements=["gymnasium>=1.1"],
     )
