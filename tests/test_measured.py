@@ -53,6 +53,14 @@ def test_another_sampling_of_the_same_motion_has_the_same_regret():
     assert found.duration == 8
 
 
+def test_a_clock_that_ends_just_before_the_episode_does_is_no_obstacle():
+    """7.99964 s of 8 s, as the times of a log say."""
+    motion = certified.load("stabilize", ROBOT).trajectories[2]
+    found = regret((motion.t * (7.99964 / 8), motion.x, motion.u), "stabilize")
+    assert found.regret == pytest.approx(0, abs=1e-3)
+    assert (found.success, found.duration) == (True, 8)
+
+
 def test_a_motion_that_the_robot_cannot_do_is_told_from_its_defects():
     known = certified.load("stabilize", ROBOT)
     motion = known.trajectories[0]
@@ -73,6 +81,8 @@ def test_arguments_that_do_not_fit_say_what_is_missing():
         regret(motion, "orbit")
     with pytest.raises(ValueError, match=r"lasts 0.98 s, and the episode of BallbotOrbit-v0 8 s: what the rest costs"):
         regret(short, "orbit", "paper", c)
+    with pytest.raises(ValueError, match=r"lasts 7\.992 s, and the episode of BallbotOrbit-v0 8 s"):
+        regret((0.999 * motion.t, motion.x, motion.u), "orbit", "paper", c)
     with pytest.raises(ValueError, match="at least two times"):
         regret(Trajectory(np.zeros(1), np.zeros((1, 8)), np.zeros((0, 2))), "stabilize")
     fallen = np.zeros((401, 8))

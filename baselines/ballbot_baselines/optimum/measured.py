@@ -14,7 +14,7 @@ from ballbot_gym.step import limit_names, outcome
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
-_SAME_TIME = 1e-9  # s: times that differ by less are one
+_CLOCK = 0.1  # of a control step: by so much may a recorded clock be short of the end of a step
 _LINEAR_STEPS = 4  # times more steps of integration along forces that run linearly than along held ones
 
 
@@ -57,7 +57,7 @@ def regret(
     Args:
         trajectory: a Trajectory, or arrays (t, x, u): t (N+1,) s, at any increasing times; x (N+1, 8) states, order and units
             in `Ballbot.STATE`; u (N, 2) N, each held until the next time, or (N+1, 2), linear between times. It may begin
-            at any time, and continue after the episode's end.
+            at any time, and continue after the episode's end, or stop a tenth of a control step before it.
         task: a name in `TASKS`, or any Task.
         robot: a name in `ROBOTS`, or any Robot; default, the robot that the task names.
         constants: (nc,) of the episode, named in the task's `constant_names`.
@@ -79,7 +79,7 @@ def regret(
         )
     c = finite_array(constants, (len(task.constant_names),), "constants")
     moved = Trajectory(moved.t - moved.t[0], moved.x, moved.u, moved.xdot)
-    steps = min(task.steps, int((moved.duration + _SAME_TIME) / task.control_dt))
+    steps = min(task.steps, int(moved.duration / task.control_dt + _CLOCK))
     x = np.array([moved.state(k * task.control_dt) for k in range(steps + 1)])
     end, violated, success = _end(task, params, moved, x, c)
     cost = _cost(task, moved, x[: end + 1], c)
