@@ -132,7 +132,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
     | cost | what this step cost, a failure's price included (0 after `reset`): the objective, and no constraint's cost |
     | reward_survive | part of the reward: survival_reward · control_dt |
     | reward_cost | part of the reward: −cost rate · control_dt |
-    | reward_goal | part of the reward: survival_reward for every second that remained at the first exit, else 0 |
+    | reward_goal | part of the reward: at the first exit survival_reward for each second that remained, and `goal_reward` |
     | tilt | rad, between the body's axis and the vertical |
     | success | the task's goal holds at the end of the episode |
     | is_success | the same, under the name that Stable-Baselines3 looks for |

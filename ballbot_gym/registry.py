@@ -88,7 +88,8 @@ def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
 
 
 def named_task(name: Any) -> str:
-    """The name in `TASKS` of a task that is given by it, by its id or that of its counterpart, or by MODULE:NAME.
+    """The name in `TASKS` of a task that is given by it, by its id or that of its counterpart, or by MODULE:NAME. Hyphens may
+    take the place of underscores.
 
     Raises:
         ValueError: no task of that name.
@@ -96,6 +97,8 @@ def named_task(name: Any) -> str:
     known = {f"{kind.__module__}:{short}": short for short, kind in TASKS.items()}
     short = (known.get(name) or short_name(name)) if isinstance(name, str) else None
     short = next((known for known, kind in TASKS.items() if short and short in (kind.id, kind.counterpart)), short)
+    if short not in TASKS and isinstance(short, str) and short.replace("-", "_") in TASKS:
+        return short.replace("-", "_")
     if short not in TASKS:
         raise ValueError(
             f"unknown task {name!r}; known: {', '.join(map(repr, TASKS))}, or MODULE:NAME where your module calls "

@@ -38,9 +38,10 @@ class Outcome(NamedTuple):
     reward_cost: Any
     """−cost rate · control_dt."""
     reward_goal: Any
-    """Pay for the time that remains, where the goal ends the episode."""
+    """Pay for the time that remains, and `Task.goal_reward`, where the goal ends the episode."""
     cost: Any
-    """The running cost, and for a failure the price of the time that remains."""
+    """The running cost, the price of the time that remains after a failure, and `Task.goal_reward` where an episode ends
+    without its goal."""
     terminated: Any
     truncated: Any
     success: Any
@@ -80,12 +81,16 @@ def outcome(
         task.survival_reward * task.control_dt,
         ops.where(success > 0, ahead, 0.0) if task.first_exit else 0.0,
     )
+    price = ops.where(failure, ahead, 0.0)
+    if task.goal_reward:
+        goal = goal + success * task.goal_reward
+        price = price + ops.where(last, 1.0 - success, failed) * task.goal_reward
     return Outcome(
         reward=survive - running + goal,
         reward_survive=survive,
         reward_cost=-running,
         reward_goal=goal,
-        cost=running + ops.where(failure, ahead, 0.0),
+        cost=running + price,
         terminated=terminated,
         truncated=ops.where(last, 1.0 - terminated, 0.0),
         success=success,

@@ -15,13 +15,14 @@ import ballbot_gym
 import ballbot_train
 from ballbot_baselines import VARIANTS, find_optimum, regret
 from ballbot_baselines.solvers.shooting import Backoff, Shooting
-from ballbot_gym import BallbotBatch, BallbotEnv, named_robot, rollout
+from ballbot_gym import BallbotBatch, BallbotEnv, BallbotVectorEnv, named_robot, rollout
 from ballbot_gym.env import make_task, robot_of
+from ballbot_gym.tasks.checks import check_methods
 from ballbot_train import RegretWrapper, evaluate
 from ballbot_train.report.film import film_frames
 from ballbot_train.report.replay import Replay, Take
 
-COUNTERPARTS = ("pendulum",)
+COUNTERPARTS = ("pendulum", "mountain_car")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -78,7 +79,7 @@ def test_the_certified_episodes_are_gymnasiums_resets_by_seed(name):
             np.testing.assert_array_equal(task.counterpart_state(env.unwrapped)[0], cache.episode(task, robot, seed)[0])
 
 
-@pytest.mark.parametrize(("name", "seed"), [("pendulum", 1), ("pendulum", 2), ("pendulum", 8)])
+@pytest.mark.parametrize(("name", "seed"), [("pendulum", 1), ("pendulum", 2), ("pendulum", 8), ("mountain_car", 4)])
 def test_the_optimums_actions_earn_its_return_in_gymnasiums_own(name, seed):
     from ballbot_classic.replay import followed, returned
 
@@ -86,6 +87,46 @@ def test_the_optimums_actions_earn_its_return_in_gymnasiums_own(name, seed):
     assert optimum.is_optimal
     earned, *_ = returned(task.counterpart, followed(name, optimum, seed), seed)
     assert earned == pytest.approx(task.survival_pay - optimum.cost, abs=1e-5)
+
+
+def test_the_goal_pays_and_missing_it_costs_as_much():
+    task, robot = make_task("mountain_car"), named_robot("mountain_car")
+    rewards, costs = [], []
+    with BallbotEnv("mountain-car") as env:
+        for place, speed, action in ((0.4, 0.03, 0.5), (-0.5, 0.0, 0.1)):
+            env.reset(seed=0, options={"state": np.array([place, speed])})
+            ended, infos = False, []
+            while not ended:
+                *_, terminated, truncated, info = env.step(np.array([action], np.float32))
+                infos.append(info)
+                ended = terminated or truncated
+            rewards.append(sum(info["reward_survive"] + info["reward_cost"] + info["reward_goal"] for info in infos))
+            costs.append(sum(info["cost"] for info in infos))
+            assert terminated == (action == 0.5)
+            assert info["reward_goal"] == (100.0 if terminated else 0.0)
+    np.testing.assert_allclose(np.add(rewards, costs), task.survival_pay)
+    assert costs[1] == pytest.approx(100 + 999 * 0.1 * 0.1**2)
+    assert task.survival_pay == 100
+    endless = type("Endless", (type(task),), {"first_exit": False})()
+    with pytest.raises(ValueError, match="goal_reward"):
+        check_methods(endless, robot, np.array([-0.5, 0.0]), np.zeros(0))
+
+
+@pytest.mark.parametrize("engine", ["native", "numpy", "torch"])
+def test_many_cars_report_what_one_does(engine):
+    short, states = replace(make_task("mountain_car"), duration=1.0), np.array([[0.44, 0.03], [-1.19, -0.02]])
+    names = ("reward_survive", "reward_cost", "reward_goal", "cost", "success")
+    many = BallbotVectorEnv(2, short, dtype="float64", engine=engine, compile=False, autoreset_mode="Disabled")
+    many.reset(seed=0, options={"state": states})
+    _, rewards, terminated, truncated, infos = many.step(np.full((2, 1), 0.5, np.float32))
+    for n, start in enumerate(states):  # one arrives in its only step, and the other does not
+        with BallbotEnv(short) as env:
+            env.reset(seed=0, options={"state": start})
+            _, reward, *ends, info = env.step(np.array([0.5], np.float32))
+        assert ends == [n == 0, n == 1] == [bool(terminated[n]), bool(truncated[n])]
+        assert rewards[n] == pytest.approx(reward, abs=1e-9)
+        assert [float(infos[name][n]) for name in names] == pytest.approx([float(info[name]) for name in names])
+        np.testing.assert_allclose(infos["state"][n], info["state"], atol=1e-12)
 
 
 def test_the_angle_may_wrap_and_the_rate_be_clipped_along_the_optimum():

@@ -111,6 +111,7 @@ def source(task: Task, params: Robot, double: bool) -> str:
         "FLAGS": len(FLAGS),
         "SURVIVAL_REWARD": float(task.survival_reward * task.control_dt),  # per step
         "FIRST_EXIT": int(task.first_exit),
+        "PRICED_GOAL": int(task.goal_reward != 0),
         "CONSTANT_DRAWS": task.constant_draws,
         "DRAWS": task.constant_draws + task.state_draws,
     }

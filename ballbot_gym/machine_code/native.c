@@ -137,8 +137,9 @@ static inline __attribute__((always_inline)) void write_outcome(const Memory *m,
     int64_t *const counts = m->counts + n;
     for (int64_t k = 0; k < count; ++k) {
         const double reward = paid[k], cost = paid[LANES + k];
-        /* the cost has a failure's price too, and the reward has not */
-        const double running = limit[k] >= 0 ? reward - SURVIVAL_REWARD : -cost;
+        /* the cost has the price of a failure, or of a goal that is missed, too, and the reward has not */
+        const int priced = limit[k] >= 0 || (PRICED_GOAL && marks[SUCCESS * LANES + k] == 0);
+        const double running = priced ? reward - SURVIVAL_REWARD : -cost;
         pay[REWARD * B + k] = reward;
         pay[COST * B + k] = cost;
         pay[SURVIVE * B + k] = SURVIVAL_REWARD;

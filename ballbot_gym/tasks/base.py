@@ -41,7 +41,8 @@ class Task(ABC):
 
     The reward of a step is (survival_reward − cost rate) · control_dt. A violated limit is a failure: it ends the episode and
     costs survival_reward for every remaining second. Reaching the goal of a first-exit task pays survival_reward for
-    every remaining second at once, so that delaying the arrival never pays more than arriving. However an episode ends,
+    every remaining second at once, so that delaying the arrival never pays more than arriving. A first-exit task may pay
+    `goal_reward` besides; an episode that does not reach the goal then costs as much more. However an episode ends,
     return + cost = `survival_pay`. So maximizing the return minimizes the cost, for any value of survival_reward.
 
     x is a state (..., n) and u what the actuators apply (..., m), as `STATE` and `ACTION` of the robot name them; c are the
@@ -92,6 +93,9 @@ class Task(ABC):
     """Number of uniform numbers that `draw_state` takes."""
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
+    goal_reward: ClassVar[float] = 0.0
+    """Paid once where a first-exit task reaches its goal, and the price of not reaching it: for costs that arriving ends, but
+    that waiting does not raise."""
     pieces: ClassVar[bool] = False
     """Whether cost, margins or motion consist of smooth pieces, as with an angle that wraps. Optimizers then take the slopes
     of the piece that a state is in, and `guesses` or `search_cases` lead to the sequence of pieces that is the best."""
@@ -126,8 +130,10 @@ class Task(ABC):
 
     @property
     def survival_pay(self) -> float:
-        """Return plus cost of every episode: survival_reward · duration. It is also the price of failing at the start."""
-        return self.survival_reward * self.duration
+        """Return plus cost of every episode: survival_reward · duration + goal_reward. It is also the price of failing at the
+        start.
+        """
+        return self.survival_reward * self.duration + self.goal_reward
 
     @property
     def limit_names(self) -> tuple[str, ...]:

@@ -26,6 +26,8 @@ def check_methods(task: Task, params: Robot, x: np.ndarray, c: np.ndarray, where
             f"{kind}.sample is never called by environments; delete it, and draw an episode from the numbers z in "
             "draw_constants and draw_state"
         )
+    if task.goal_reward and not task.first_exit:
+        raise ValueError(f"{kind}.goal_reward is paid where reaching the goal ends the episode; set first_exit = True")
     again = task.start(*_draws(task, c), params), task.start(*_draws(task, c), params)
     if again[0] != again[1]:
         raise ValueError(f"{kind}.draw_state gives other states for the same z and c; draw from z alone")

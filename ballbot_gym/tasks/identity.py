@@ -56,8 +56,9 @@ def problem_parts(task: Task, params: Robot) -> dict[str, str]:
     Two tasks that share a name and differ in a cost have different digests, and so have two robots of one name.
     """
     probes, rng = list(_probes(task, params)), np.random.default_rng(0)
+    goal_reward = [task.goal_reward] if task.goal_reward else []  # digests of tasks without one stay
     values = (
-        [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit],
+        [task.id, task.problem(), task.survival_reward, task.steps, task.first_exit, *goal_reward],
         [[_digits(part) for part in task.sample(rng, params)] for _ in range(_PROBES)],
         [_rounded(task.cost, *probe) for probe in probes],
         *([_rounded(of, x, c) for x, _, c in probes] for of in (task.limits, task.goal)),

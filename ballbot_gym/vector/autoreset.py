@@ -58,8 +58,11 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
     if waiting is not None:
         parts[:, waiting] = 0.0
     if ended.size:
-        failed = np.flatnonzero(result.violated >= 0)
-        parts[1, failed] = reward[failed] - survive  # the cost has a failure's price too
+        priced = result.violated >= 0
+        if batch.task.goal_reward:
+            priced = priced | ((result.terminated | result.truncated) & ~result.success)
+        failed = np.flatnonzero(priced)
+        parts[1, failed] = reward[failed] - survive  # the cost has the price of what failed too
         if batch.task.first_exit:
             parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * result.success[ended]
     seen, last = (part.astype(np.float32, copy=False) for part in (result.observation, result.final_observation))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ballbot_baselines.optimum.measured import Regret, regret
     from ballbot_baselines.optimum.optimum import Optimum
     from ballbot_baselines.solvers.guess import along_path
+    from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
     from ballbot_baselines.solvers.shooting import Backoff
 
 need(__name__, "casadi", "scipy")
@@ -56,8 +57,11 @@ __all__ = [
     "Controller",
     "LqrController",
     "NmpcController",
+    "Ocp",
+    "OcpSolver",
     "Optimum",
     "Regret",
+    "Solution",
     "StateFromSensors",
     "TrajoptController",
     "TvlqrController",
@@ -79,6 +83,7 @@ _MODULES = {
     "optimum.measured": ("Regret", "regret"),
     "optimum.optimum": ("Optimum",),
     "solvers.guess": ("along_path",),
+    "solvers.ocp": ("Ocp", "OcpSolver", "Solution"),
     "solvers.shooting": ("Backoff",),
 }
 __getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

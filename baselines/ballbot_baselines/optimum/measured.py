@@ -85,6 +85,8 @@ def regret(
     cost = _cost(task, moved, x[: end + 1], c)
     if violated:
         cost += task.survival_reward * task.control_dt * (task.steps - end)
+    if not success:
+        cost += task.goal_reward
     optimum = find_optimum(task, params, x[0], c, twice=True)
     return Regret(
         regret=cost / optimum.cost - 1,

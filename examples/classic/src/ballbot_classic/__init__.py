@@ -5,7 +5,7 @@ Installed, the package is found by `import ballbot_gym`. From a checkout, `ballb
 
 from importlib import import_module
 
-SYSTEMS = ("pendulum", "cart_pole", "kelly", "acrobot")
+SYSTEMS = ("pendulum", "mountain_car", "cart_pole", "kelly", "acrobot")
 """Modules, of a system each."""
 
 

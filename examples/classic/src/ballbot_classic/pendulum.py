@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,15 @@ from ballbot_gym import (
 )
 
 _TURN = 2 * math.pi
-# of guessed swing-ups: torque, side of the first push, how many control steps it and that to the other side last, energy
-_FAMILY = (
-    (2.0, 1.7, 1.4, 1.0),
-    (1.0, -1.0),
-    (0, 2, 4, 6, 8, 10, 14, 18),
-    (0, 4, 8, 12, 16, 20),
-    (0.0, 0.5, 1.0, 1.5),
+# families of guessed swing-ups: torque, side of the first push, how many control steps it and that to the other side last,
+# and energy
+_FAMILIES = (
+    ((2.0, 1.7, 1.4, 1.0), (1.0, -1.0), (0, 2, 4, 6, 8, 10, 14, 18), (0, 4, 8, 12, 16, 20), (0.0, 0.5, 1.0, 1.5)),
+    ((2.0, 1.4), (1.0, -1.0), (0, 3, 6, 10, 14, 18), (0, 4, 8, 12, 16, 20), (0.0, 1.0)),
 )
-_SAME = 1e-3  # relative: guesses whose costs differ by less are the same
+_RANDOM = 2000  # more swing-ups, after up to `_PUSHES` pushes of up to `_LONGEST` control steps
+_PUSHES, _LONGEST = 4, 24
+_SAME = 1e-3  # relative: guesses of a family whose costs differ by less are the same
 
 
 @dataclass(frozen=True)
@@ -129,22 +130,28 @@ class PendulumUp(Task):
 
     def guesses(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[tuple[np.ndarray, np.ndarray]]:
         """Swing-ups by energy shaping, with less and with all of the torque, and to different speeds at the top, after a push
-        to either side and one to the other. The cheapest come first, and those that cost the same are left out.
+        to either side and one to the other, and after random pushes. The cheapest come first, and those of a family that cost
+        the same are left out.
         """
-        torque, side, first, second, surplus = np.array(list(itertools.product(*_FAMILY))).T
+        family, torque, surplus, pushed, until = _swing_ups(params.force_limit)
         theta, rate = np.full(len(torque), x[0]), np.full(len(torque), x[1])
         states, torques, costs = [(theta, rate)], [], np.zeros(len(torque))
         for k in range(self.steps):
-            pushed = np.where(k < first, 1.0, np.where(k < first + second, -1.0, 0.0))
-            u = np.where(pushed == 0, _shaped(params, theta, rate, torque, surplus), side * pushed * torque)
+            u = _shaped(params, theta, rate, torque, surplus)
+            for push, end in zip(pushed.T[::-1], until.T[::-1], strict=True):
+                u = np.where(k < end, push, u)
             costs += self.control_dt * self.cost((theta, rate), (u,), ())
             theta, rate = params.step((theta, rate), (u,), self.control_dt)
             states.append((theta, rate))
             torques.append(u)
         motions, applied = np.array(states).transpose(2, 0, 1), np.array(torques).T[..., None]
-        order = np.argsort(costs, kind="stable")
-        new = np.diff(costs[order], prepend=0.0) > _SAME * costs[order]
-        return [(motions[i], applied[i]) for i in order[new]]
+        kept = []
+        for number in range(int(family[-1]) + 1):
+            order = np.flatnonzero(family == number)
+            order = order[np.argsort(costs[order], kind="stable")]
+            kept.append(order[np.diff(costs[order], prepend=0.0) > _SAME * costs[order]])
+        order = np.concatenate(kept)
+        return [(motions[i], applied[i]) for i in order[np.argsort(costs[order], kind="stable")]]
 
     def search_cases(self, episode: Any) -> list[Any]:
         """Solutions from the guesses, in the cases of turns and clipped rates to which they lead."""
@@ -165,6 +172,29 @@ class EnergyShaping:
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         """(1,) torque, N·m, in state x (2,)."""
         return _shaped(self._params, x[:1], x[1:], self._params.force_limit, 0.0)
+
+
+@lru_cache(maxsize=4)
+def _swing_ups(limit: float) -> tuple[np.ndarray, ...]:
+    """Of n guesses the families (n,), torques (n,) and surplus energies (n,), and the pushes (n, k) before, each until a
+    control step (n, k).
+    """
+    grids = [np.array(list(itertools.product(*family))) for family in _FAMILIES]
+    family = np.repeat(np.arange(len(grids) + 1), [*map(len, grids), _RANDOM])
+    torque, side, first, second, surplus = np.concatenate(grids).T
+    pushed, until = np.zeros((2, len(torque), _PUSHES))
+    pushed[:, 0], pushed[:, 1] = side * torque, -side * torque
+    until[:, 0], until[:, 1] = first, first + second
+    rng = np.random.default_rng(0)
+    ends = np.cumsum(rng.integers(1, _LONGEST, (_RANDOM, _PUSHES)), axis=1)
+    ends[np.arange(_PUSHES) >= rng.integers(0, _PUSHES, (_RANDOM, 1))] = 0
+    return (
+        family,
+        np.append(torque, rng.uniform(0.4, 1.0, _RANDOM) * limit),
+        np.append(surplus, rng.uniform(0.0, 1.5, _RANDOM)),
+        np.concatenate([pushed, rng.uniform(-limit, limit, (_RANDOM, _PUSHES))]),
+        np.concatenate([until, ends]),
+    )
 
 
 def _shaped(params: Any, theta: np.ndarray, rate: np.ndarray, torque: Any, surplus: Any) -> np.ndarray:

@@ -17,10 +17,12 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
+from ballbot_baselines import Ocp, OcpSolver, Solution
+
+Guesses = list[tuple[np.ndarray, np.ndarray]]
 
 _TURN = 2 * math.pi
-_SOLVED = 24  # guesses
+_SOLVED = 160  # guesses
 _WORSE = 1.25  # times the best solution: guesses that cost more lead to no better one
 _ROUNDS = 60  # changes of the case, each by a control step or so
 _CHANGES, _CLIPS = 8, 3  # of the number of turns, and intervals of clipped rates, in an episode
@@ -29,10 +31,16 @@ _ROOM = 1e-7  # kept from limits, so that rounding breaks none
 _NEVER = 1e6
 
 
-def solutions(task: Any, episode: Any) -> list[Solution]:
-    """Solutions of an episode of `PendulumUp`, see `Task.search_cases`."""
+def solutions(task: Any, episode: Any, guesses: Guesses | None = None) -> list[Solution]:
+    """Solutions of an episode of `PendulumUp`, see `Task.search_cases`.
+
+    Args:
+        task: the task.
+        episode: the problem.
+        guesses: states (n+1, 2) and actions (n, 1) to start from; default, those of the task.
+    """
     params, found = episode.params, list[Solution]()
-    for x, u in task.guesses(episode.x0, episode.c, params)[:_SOLVED]:
+    for x, u in task.guesses(episode.x0, episode.c, params)[:_SOLVED] if guesses is None else guesses:
         if _cost(task, x, u) > _WORSE * min((solution.cost for solution in found), default=math.inf):
             break
         least, clipped = math.inf, np.abs(x[1:, 1]) >= params.speed_limit

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from ballbot_baselines import Optimum
-from ballbot_gym.env import make_task, robot_of
+from ballbot_gym import TASKS, named_robot
 
 
 def followed(task: str, optimum: Optimum, seed: int, env: gymnasium.Env | None = None) -> np.ndarray:
@@ -24,7 +24,8 @@ def followed(task: str, optimum: Optimum, seed: int, env: gymnasium.Env | None =
     Returns:
         what to give to `returned`, in the counterpart's units.
     """
-    problem, limit = make_task(task), robot_of(task).force_limit
+    problem = TASKS[task]()
+    limit = named_robot(problem.ROBOT).force_limit
     env = gymnasium.make(problem.counterpart) if env is None else env
     env.reset(seed=seed)
     space: Any = env.action_space
