@@ -266,7 +266,7 @@ def test_options_that_pages_name_are_options_of_the_commands(typed):
                 else options.get(name, everywhere)
             )
             assert set(re.findall(r"--[a-z][a-z-]*", line)) <= of | {"--help", "--version"}, f"{page}: {line}"
-    _, _, table = (ROOT / "docs" / "settings.md").read_text().partition("## What all runs take")
+    _, _, table = (ROOT / "docs" / "settings.md").read_text().partition("## Options of all learners")
     assert set(re.findall(r"`(--[a-z][a-z-]*)", table)) <= set.union(*learners.values())
 
 

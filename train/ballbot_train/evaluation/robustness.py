@@ -8,8 +8,8 @@ The tracks of `ballbot_gym.robot.randomization` are unknown robots. Every episod
 robot, whose first forces are zero while its delay lasts. Only a controller with access to the drawn parameters could reach
 it. In units of that optimum J, regret is the sum of two parts:
 
-- what not knowing costs: how far the best controller of the table is from J in the same episode,
-- what the controller loses: how much more it costs than that best controller.
+- what the hidden parameters cost: how far the best controller of the table is from J in the same episode,
+- what the controller adds: how much more it costs than that best controller.
 
 What delay costs is a column of its own, because no controller could avoid it: J minus the optimum without delay.
 """
@@ -147,9 +147,10 @@ def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> 
     """One row per track, task and controller; seed is of the bootstrap.
 
     The labels of a row are its "track", the "best" controller of the track and task, and three means over episodes, in units
-    of the episode's optimum, NaN without an episode: "delay_costs", what delay adds to the optimum; "not_knowing_costs", the
-    regret of the best controller in the episodes in which neither of the two fails; "controller_loses", the row's further
-    regret in the same episodes. The best controller has the least mean regret among those that succeed most often.
+    of the episode's optimum, NaN without an episode: "delay_costs", what delay adds to the optimum;
+    "hidden_parameters_cost", the regret of the best controller in the episodes in which neither of the two fails; and
+    "controller_adds", the row's further regret in the same episodes. The best controller has the least mean regret among
+    those that succeed most often.
     """
     regrets: dict[tuple[str, str, str], dict[int, float]] = {}
     for result in results:
@@ -167,7 +168,7 @@ def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> 
         pairs = np.array([(of_best[episode], regret) for episode, regret in own.items()])
         pairs = pairs[np.isfinite(pairs).all(axis=1)]
         unknown, lost = pairs.mean(axis=0).tolist() if len(pairs) else (math.nan, math.nan)
-        costs = {"delay_costs": delay, "not_knowing_costs": unknown, "controller_loses": lost - unknown}
+        costs = {"delay_costs": delay, "hidden_parameters_cost": unknown, "controller_adds": lost - unknown}
         rows.append(replace(row, labels={"track": track, **costs, "best": best}))
     return rows
 
@@ -186,7 +187,7 @@ TRACK_TABLE: dict[str, Callable[[Row], str]] = {
     "mean regret, %": lambda row: _percent(row.regret_mean),
     "95 % interval": lambda row: _percent(row.regret_low, row.regret_high),
     "delay costs, %": lambda row: _percent(row.labels["delay_costs"]),
-    "not knowing costs, %": lambda row: _percent(row.labels["not_knowing_costs"]),
-    "controller loses, %": lambda row: _percent(row.labels["controller_loses"]),
+    "hidden parameters cost, %": lambda row: _percent(row.labels["hidden_parameters_cost"]),
+    "controller adds, %": lambda row: _percent(row.labels["controller_adds"]),
 }
 """What the table of tracks shows of a row of `track_rows`."""
