@@ -41,15 +41,18 @@ def test_plain_ppo_trains_and_is_measured_on_certified_episodes(capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="71.5 % come to rest in the goal, and 98.5 % in it or near it, with a mean regret of 20.1 %")
-def test_plain_ppo_comes_to_rest_in_the_goal():
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_plain_ppo_comes_to_rest_in_the_goal(seed):
     torch.set_num_threads(1)
+    example = load("plain_ppo")
     began = time.process_time()
-    model = load("plain_ppo").train(4_900_000, seed=0)
-    assert time.process_time() - began < 600  # five minutes of two cores
-    row = evaluate(model, "stabilize", physics="rk4")
+    model = example.train(example.STEPS, seed)
+    seconds = time.process_time() - began
+    row = evaluate(model, "stabilize")
+    print(seconds, row, row.near, row.regret_median, row.physics)  # what the pages say, with pytest -s
     assert row.success >= 0.95
     assert row.regret_mean < 0.15
+    assert seconds < 600  # five minutes of two cores
 
 
 def test_learning_curves_are_of_all_seeds_of_a_folder(capsys, tmp_path):
