@@ -54,6 +54,19 @@ def test_the_site_shows_a_notebook_with_its_outputs(docs, tmp_path):
     ]
 
 
+def test_notebooks_keep_what_is_printed_between_progress_bars(docs):
+    import make_notebooks
+
+    bar = "\x1b[?25l\r  episodes 1/2\n\r\x1b[2K  episodes 2/2\n\x1b[?25h\r\x1b[1A\x1b[2K"
+    figure = nbformat.v4.new_output("display_data", {"image/png": "aGk=\n"})
+    outputs = [
+        nbformat.v4.new_output("stream", name="stdout", text=text) for text in (bar, "row 1\n" + bar + "row 2\n")
+    ]
+    shown = make_notebooks.without_bars([*outputs, figure])
+    assert [output.get("text") for output in shown] == ["row 1\nrow 2\n", None]
+    assert make_notebooks.without_bars([figure]) == [figure]
+
+
 def test_the_site_says_of_every_setting_what_it_is(docs):
     import hooks
 
