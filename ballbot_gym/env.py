@@ -129,7 +129,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
     | key | meaning |
     |---|---|
     | state | (8,) float64 state x; order and units in `Ballbot.STATE`; with wheels (11,), in `Omni.STATE` |
-    | cost | what this step cost, a failure's price included (0 after `reset`): the objective, and no constraint's cost |
+    | cost | cost of this step, with the price of a failure (0 after `reset`): the objective, and no constraint's cost |
     | reward_survive | part of the reward: survival_reward · control_dt |
     | reward_cost | part of the reward: −cost rate · control_dt |
     | reward_goal | part of the reward: at the first exit survival_reward for each second that remained, and `goal_reward` |
@@ -139,25 +139,25 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
     | failure | a limit is violated: the robot fell, touched something or left the arena |
     | violated | the index of that limit in `limit_names`, which holds "tilt", "arena" or "obstacle 2", for example; else −1 |
     | constraint_cost | 1.0 where a limit is violated, else 0.0: the cost of safe reinforcement learning |
-    | force | (2,) N, applied in this step (0 after `reset`); with wheels (3,), the pull of each at standstill |
+    | force | (2,) N, applied in this step (0 after `reset`); with wheels (3,), the force of each wheel at standstill |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
-    | grip | (4,) f_x, f_y, N of the floor on the ball as the step began, and the friction it needs (0 after `reset`) |
-    | drawn | (6,) or (14,) what a randomization drew for the episode; names in `Randomization.DRAWN` |
+    | grip | (4,) f_x, f_y, N of the floor on the ball when the step began, and the friction it needs (0 after `reset`) |
+    | drawn | (6,) or (14,) parameters that a randomization drew for the episode; names in `Randomization.DRAWN` |
 
     Only envs with a randomization have `drawn`, and only robots whose friction is limited have `grip`. Such a robot has lost
-    its grip if it needs more friction, or a floor that pulls, when a step begins or at its end. The closed form cannot say
-    how it slips, so with physics="rk4" that is a failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate
-    the contact of a rolling ball: it slips or leaves the floor, and that by itself is no failure. `grip` is then the force at
-    the end of the step.
+    its grip if, at the beginning or at the end of a step, its motion needs more friction than there is, or a floor that
+    pulls. The closed form does not model a slipping ball, so with physics="rk4" a loss of grip is a failure, and `violated`
+    is the index of "grip". PyBullet and MuJoCo simulate the contact of a rolling ball: it may slip or leave the floor, which
+    is no failure. `grip` is then the force at the end of the step.
 
-    Where the simulation of PyBullet or MuJoCo becomes unstable, the episode fails, and `violated` is the index of "engine".
-    The state is then the last one before.
+    If the simulation of PyBullet or MuJoCo becomes unstable, the episode fails, and `violated` is the index of "engine". The
+    state is then the last one before the instability.
 
-    Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
+    Task, robot, physics and spaces of an env are fixed: setting such an attribute raises an AttributeError.
 
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state. The same actions then give
-    bit-identical results. A copy of a Bullet env has a physics client of its own. The page is not copied.
+    bit-identical results. A copy in PyBullet has a physics client of its own. The page of render_mode="human" is not copied.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
@@ -187,10 +187,11 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
                 10 ms for rk4.
             randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF,
                 which takes 2 ms and 5 kB of memory that PyBullet never frees.
-            robot: a name in `ROBOTS`, such as "paper", "rolling", "kugle" or "omni", or a Robot. Tasks draw other
-                episodes for some.
+            robot: a name in `ROBOTS`, such as "paper", "rolling", "kugle" or "omni", or a Robot. For some robots the
+                episodes of a task are easier.
             history: number of earlier observations that are appended to each observation, the latest first, each with the
-                action (2) that followed it. At the start of an episode they are copies of its first one, with the action 0.
+                action (2) that followed it. At the start of an episode they are copies of its first observation, each with
+                an action of 0.
             observation: "state"; or "sensors" of a robot with wheels, as `ballbot_gym.robot.sensors` says.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
@@ -250,8 +251,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
 
         Args:
             seed: seeds the draw of this and the following episodes.
-            options: may hold "state", the (8,) initial state; "constants", the (nc,) constants of the episode or a dict of
-                some of them by name; and "drawn", what `info` has under that key. Everything else is drawn.
+            options: may contain "state", the (8,) initial state; "constants", the (nc,) constants of the episode or a dict of
+                some of them by name; and "drawn", the parameters of a randomization, as `info` has them. Everything else is
+                drawn at random.
 
         Raises:
             ValueError: an unknown option, or a state or constants of the wrong shape, not finite, or unsafe.
@@ -336,7 +338,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
 
     @property
     def episode_params(self) -> Robot:
-        """The robot of the running episode: `params`, unless randomized."""
+        """The robot of the running episode: `params`, or what a randomization drew."""
         return self._robot
 
     @property

@@ -41,9 +41,9 @@ _SHIPPED_ROBOTS = tuple(ROBOTS)
 
 
 def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
-    """Gives a class of tasks a name and its Gymnasium id, which all commands accept. May decorate the class.
+    """Registers a class of tasks under a name and its Gymnasium id, which all commands accept. It may be used as a decorator.
 
-    To register a class again, as a notebook does whose cell runs twice, replaces it.
+    If a class of the same name is registered again, for example by a notebook cell that runs twice, it replaces the old one.
 
     Args:
         kind: a dataclass that derives from `Task`, with all of its methods.

@@ -34,12 +34,11 @@ class Controller(Protocol):
 
 
 class ActionController:
-    """A function from observation to action as a Controller. It gets the observations that the env would show.
+    """A function from observation to action as a Controller. It computes the observations that the env would return.
 
-    This is the one place where an observation is turned into a force. `action` is the function, and `history` that of its
-    observations. It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the function takes observations
-    (B, no). If `told` is given, (..., 3), these estimates of the three
-    factors in `ROBOT_FACTORS` are appended to the observation.
+    `action` is the function, and `history` the number of earlier observations that it takes. It acts in B episodes at once,
+    given states (B, 8) and constants (B, nc), if the function takes observations (B, no). If `told` is set, (..., 3), these
+    estimates of the three factors in `ROBOT_FACTORS` are appended to the observation.
     """
 
     def __init__(self, task: Task, params: Robot, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0):
@@ -85,11 +84,11 @@ def _components(vector: np.ndarray) -> tuple[Any, ...]:
 class Episode(Moving):
     """One episode under one controller.
 
-    `trajectory` holds the applied forces. `cost` includes a failure's price. From `settle_time`, s, the goal held until the
-    end; it is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`,
-    `act_seconds` its median wall time in `act`. `goal_error` is `Task.goal_error` of the last state: how far from the goal
-    the episode ended, in units of the goal's tolerances. `violated` is the name of the limit that was violated, or "".
-    `markers` are what its task draws.
+    `trajectory` contains the applied forces. `cost` includes the price of a failure. `settle_time`, s, is the time after
+    which the robot stayed in the goal; it is NaN if the robot was not there at the end. `reset_seconds` is the wall time of
+    the controller's `reset`, and `act_seconds` the median wall time of its `act`. `goal_error` is `Task.goal_error` of the
+    last state: how far from the goal the episode ended, in units of the goal's tolerances. `violated` is the name of the
+    limit that was violated, or "". `markers` are what the task adds to pictures.
     """
 
     trajectory: Trajectory
@@ -126,16 +125,16 @@ def rollout(
 
     Args:
         env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
-        controller: gets the state as the env's sensors report it. Without sensor noise this is the true state. In an env
-            with observation="sensors" it gets what they show, and must have an attribute `senses` that is true.
+        controller: receives the state as the env's sensors report it, which is the true state without sensor noise. In an
+            env with observation="sensors" it receives the sensor readings, and must have an attribute `senses` that is true.
         seed: as for `env.reset`.
         options: as for `env.reset`.
         watch: called before each control step with the observation of the controller, while the env is still in the state
             where the step starts.
 
     Raises:
-        ValueError: the env shows sensors, and the controller needs states.
-        Exception: what the controller's `reset` raises, for instance a PlanError where it found no plan.
+        ValueError: the env observes sensors, and the controller needs states.
+        Exception: whatever the controller's `reset` raises, for instance a PlanError if it found no plan.
     """
     ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit

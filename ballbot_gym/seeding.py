@@ -19,8 +19,8 @@ _WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then
 def spawned(seed: int) -> int:
     """The seed of a run's first env, from 0 to 2³² − 1, where env i is seeded with the i-th number after it.
 
-    Gymnasium seeds env i with seed + i. So runs with the seeds 0 and 1 would see the same episodes, moved by one env.
-    Spawned seeds are far apart: two runs of 1,000 envs have an episode in common with a chance of 5e-7.
+    Gymnasium seeds env i with seed + i. So runs with the seeds 0 and 1 would have all episodes but one in common. Spawned
+    seeds are far apart: the chance that two runs of 1,000 envs have an episode in common is 5e-7.
 
     Raises:
         ValueError: the seed is negative.

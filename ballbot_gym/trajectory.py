@@ -20,10 +20,10 @@ class TrajectoryError(ValueError):
 
 
 class Displayed:
-    """What shows itself by its facts."""
+    """An object that notebooks display as a line of facts."""
 
     def facts(self) -> dict[str, str]:
-        """What there is to say in a line: figures with their units, by what they are."""
+        """The facts, by name: numbers with their units, as text."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -31,9 +31,9 @@ class Displayed:
 
 
 class Moving(Displayed):
-    """What shows a motion: a trajectory, an episode or an optimum.
+    """The methods `show` and `plot` of everything that contains a motion: trajectories, episodes and optima.
 
-    Replays and figures are drawn by `ballbot_train.report`, which is imported when it is asked for.
+    `ballbot_train.report` draws replays and figures, and is imported when one of these methods is called.
     """
 
     @property
@@ -46,8 +46,8 @@ class Moving(Displayed):
 
         Args:
             others: trajectories, episodes or optima to show next to it.
-            labels: a name for each; default, what they are.
-            robot: what is drawn, a name in `ROBOTS` or its parameters.
+            labels: a name for each motion; default, its kind.
+            robot: the robot that is drawn, a name in `ROBOTS` or its parameters.
 
         Returns:
             The page that was written and opened; None in a notebook.

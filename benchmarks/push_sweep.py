@@ -1,7 +1,7 @@
 """The hardest push that the robot recovers from: LQR, trajectory optimization re-planned from the push, and NMPC.
 
-At rest, the body is hit at its centre of mass by a horizontal impulse. LQR and NMPC are not
-prepared for it: NMPC has planned to stand still. Re-planning starts from the state after the push, without a time limit.
+The robot is at rest when a horizontal impulse hits the centre of mass of its body. LQR and NMPC are not prepared for it: NMPC
+has planned to stand still. Trajectory optimization computes a new plan from the state after the push, without a time limit.
 """
 
 from collections.abc import Callable

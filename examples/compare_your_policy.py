@@ -12,7 +12,7 @@ GAIN = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1
 
 
 def mine(observation: np.ndarray) -> np.ndarray:
-    """Action in [−1, 1]², of 350 N, for Stabilize's observation: position, lean, velocity and lean rate, scaled."""
+    """Action in [−1, 1]², in units of 350 N, for an observation of Stabilize: scaled position, lean, velocity, lean rate."""
     return np.clip(GAIN @ observation, -1, 1)
 
 

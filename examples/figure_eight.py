@@ -1,6 +1,6 @@
-"""A figure eight ridden by the clock: a task of one's own whose cost depends on the time.
+"""Follow a point that moves along a figure eight: an example of your own task, with a cost that depends on the time.
 
-ballbot optimize figure_eight:figure_eight, or any other command, from the folder of this file; see docs/own.md.
+Run `ballbot optimize figure_eight:figure_eight`, or any other command, in the folder of this file; see docs/own.md.
 """
 
 import math

@@ -16,7 +16,10 @@ POINTS, RESAMPLES = 100, 2000
 
 
 def read(folder: Path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Minutes of one core, and mean regrets on the certified episodes, of each run; no success counts as failing at once."""
+    """Minutes of one core, and mean regrets on the certified episodes, of each run.
+
+    In these means, an episode without success counts at least as much as an immediate failure.
+    """
     runs = []
     for path in sorted(folder.glob("*/evaluations.csv")):
         rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))

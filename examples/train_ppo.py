@@ -68,8 +68,8 @@ def main(
     Args:
         task: name of the task.
         steps: env steps in all.
-        envs: that are stepped together, in the closed-form physics.
-        seed: of everything that is drawn.
+        envs: number of environments that are stepped at once, in the closed-form physics.
+        seed: seed of everything that is drawn.
         every: env steps from one report to the next.
         learning_rate: step size.
         falling: the step size falls linearly to 0.

@@ -1,6 +1,6 @@
-"""Points to be passed in turn at given times: a task of one's own whose cost depends on the time.
+"""Pass points one after the other at given times: an example of your own task, with a cost that depends on the time.
 
-ballbot optimize waypoints:waypoints, or any other command, from the folder of this file; see docs/own.md.
+Run `ballbot optimize waypoints:waypoints`, or any other command, in the folder of this file; see docs/own.md.
 """
 
 import math

@@ -3,7 +3,7 @@
 `load(task, robot)` reads what comes with the package, or what `ballbot certify` and evaluation computed into the user's
 cache: initial states, constants, optimal costs and the solver's status of each episode, and optimal trajectories. Costs hold
 for the env's discretization with physics="rk4". A set says what it was made for, and `load` refuses it for any other task or
-robot: a cost divided by the optimum of something else is no regret.
+robot, because a regret relative to the optimum of another problem has no meaning.
 """
 
 import itertools

@@ -69,7 +69,7 @@ class Robot(ABC):
     OUTPUT_SCALE: ClassVar[tuple[float, ...]] = ()
     """What an observation divides each output by."""
     OUTPUT_STATES: ClassVar[int] = 0
-    """How many components of the state, the last ones, are observed by as many of the last outputs alone."""
+    """Number n of components of the state, its last ones, that only the last n outputs observe."""
     MEASUREMENTS: ClassVar[tuple[Quantity, ...]] = ()
     """What `measurements` gives."""
     SYMMETRIES: ClassVar[frozenset[str]] = frozenset()
@@ -82,11 +82,11 @@ class Robot(ABC):
     """Whether `step` is overridden by a map over a control step of fixed length. It must then agree with `derivative` as to
     which states are equilibria."""
     CONTACT: ClassVar[bool] = False
-    """Whether engines of contact simulate the robot on a floor, where it may slip."""
+    """Whether PyBullet and MuJoCo simulate the robot with contact on a floor, where it may slip."""
     PUSHABLE: ClassVar[bool] = False
     """Whether the action is the horizontal force on the robot, to which a push adds."""
     TRACK_FILTERS: ClassVar[bool] = False
-    """Whether filters estimate what `TRACKS` hide of this kind of robot."""
+    """Whether there are filters that estimate the hidden parameters of `TRACKS` for this kind of robot."""
     SENSORS: ClassVar[tuple[str, ...]] = ()
     """Numbers that sensors read, besides `number_names`; () where `observation="sensors"` is not modelled. See
     `ballbot_gym.robot.sensors`."""
@@ -95,7 +95,7 @@ class Robot(ABC):
     """Classes of the fields that hold several numbers each."""
 
     force_limit: float
-    """What an action of 1 applies, in the units of `ACTION`."""
+    """What the actuators apply for an action of 1, in the units of `ACTION`."""
 
     def __post_init__(self) -> None:
         for field in fields(self):  # pyright: ignore[reportArgumentType]  subclasses are dataclasses

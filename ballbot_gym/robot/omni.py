@@ -53,7 +53,7 @@ _SPIN_SPEED = 1.0  # rad/s: a slower spin meets friction in proportion to it
 
 @dataclass(frozen=True)
 class Wheels:
-    """Three omni-wheels and their motors. `Omni.force_limit` is a motor's pull at standstill on the ball, N.
+    """Three omni-wheels and their motors. `Omni.force_limit` is the force of a wheel on the ball at stall, N.
 
     | field | meaning | unit |
     |---|---|---|
@@ -105,7 +105,7 @@ class Omni(RollingBall):
     |---|---|
     | wheels | the wheels and their motors |
 
-    An action is the pull of each wheel at standstill, N, and force_limit the largest one.
+    An action has a component for each wheel: the force, N, that it exerts on the ball at standstill, at most force_limit.
     """
 
     wheels: Wheels = field(kw_only=True)

@@ -1,4 +1,4 @@
-"""The robots by name: their URDFs, and the episodes that each is given."""
+"""The robots by name: their URDFs, and the fields of tasks that differ for each robot."""
 
 import os
 import re
@@ -117,10 +117,11 @@ def robot_setting(robot: str) -> dict[str, str]:
 
 
 def robot_name(params: Robot) -> str:
-    """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
+    """The name in `ROBOTS` of a robot, or of the robot that it is a variant of.
 
-    With another friction it is the same robot, unless that has a name of its own. Any other is taken for the first that is
-    registered of its kind. `registered_name` is for records, which must not mistake one.
+    A robot that is not registered, and differs from a registered one only in friction, has the name of that robot. Any other
+    variant has the name of the first registered robot of its kind. Records use `registered_name`, which gives a name to
+    exactly the registered robots only.
 
     Raises:
         ValueError: no robot of this kind is registered.

@@ -24,7 +24,7 @@ class BallbotTask(Task):
     max_tilt: float = math.radians(80)
     """Tilt beyond which the robot has fallen, rad."""
     heading_weight: float = field(default=0.0, repr=False)
-    """Of 2 (1 − cos ψ), which is ψ² near 0, of robots with wheels, which yaw, 1/s."""
+    """Weight of 2 (1 − cos ψ), which is ψ² near 0, where ψ is the yaw of a robot with wheels, 1/s."""
 
     margin_names: ClassVar[tuple[str, ...]] = ("tilt",)
     NOT_THE_PROBLEM: ClassVar[frozenset[str]] = Task.NOT_THE_PROBLEM | {"arena_radius", "arena_factor"}
@@ -43,7 +43,7 @@ class BallbotTask(Task):
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
         """The initial state as a function of `state_draws` uniform numbers z, in an episode with constants c.
 
-        It may have the first eight components alone. With wheels the robot then neither turns nor spins at the start.
+        It may return the first eight components only. A robot with wheels then has a yaw of 0 and no spin at the start.
         """
 
     def start(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""Task: the one definition of an optimal-control problem that env, experts, optimizer and leaderboard use."""
+"""Task: an optimal-control problem. Environments, experts, optimizers and the leaderboard all use this one definition."""
 
 import math
 import zlib
@@ -61,12 +61,12 @@ class Task(ABC):
     control_dt: float = 0.02
     """How long each force is held, s."""
     survival_reward: float = 100.0
-    """Paid for every second lived, 1/s: more than nearly every motion in the arena costs."""
+    """Reward for every second without failure, 1/s. Nearly every motion in the arena costs less per second."""
 
     id: ClassVar[str]
     """Gymnasium id."""
     ROBOT: ClassVar[str] = "paper"
-    """Name of the robot that does the task where none is named."""
+    """Name of the task's default robot."""
     observation_scale: ClassVar[tuple[float, ...]]
     """What each observed quantity is divided by, in its unit."""
     constant_names: ClassVar[tuple[str, ...]] = ()
@@ -97,10 +97,10 @@ class Task(ABC):
     """Paid once where a first-exit task reaches its goal, and the price of not reaching it: for costs that arriving ends, but
     that waiting does not raise."""
     pieces: ClassVar[bool] = False
-    """Whether cost, margins or motion consist of smooth pieces, as with an angle that wraps. Optimizers then take the slopes
-    of the piece that a state is in, and `guesses` or `search_cases` lead to the sequence of pieces that is the best."""
+    """Whether cost, margins or motion consist of smooth pieces, as with an angle that wraps. Optimizers then use the slopes
+    of the piece that a state is in. They do not search over sequences of pieces: `guesses` or `search_cases` must do that."""
     counterpart: ClassVar[str] = ""
-    """Id of an environment of another package that is this very problem; see `ballbot_gym.RegretWrapper`."""
+    """Id of an environment of another package that poses this very problem; see `ballbot_train.RegretWrapper`."""
     clock: ClassVar[bool] = False
     """Whether cost, goal, margins and observation depend on the episode's time."""
 
@@ -141,7 +141,7 @@ class Task(ABC):
         return self.margin_names
 
     def problem(self) -> str:
-        """The task's name and the fields that define its optima. It identifies the task of an optimum or a policy."""
+        """Text of the task's name and the fields that define its optima. It identifies the task of an optimum or a policy."""
         named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
         named = (name for name in named if name not in self.MAY_BE_ZERO or getattr(self, name))
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
@@ -197,14 +197,14 @@ class Task(ABC):
         raise NotImplementedError(f"{type(self).__name__} has no method `counterpart_state`")
 
     def goal_distance(self, x: Vector, c: Vector) -> Any:
-        """About how far a state is from the goal, m, for learners that shape rewards; None where a task defines none."""
+        """Approximate distance of a state from the goal, m, for learners that shape rewards; None if a task defines none."""
         return None
 
     def measures(self, x: np.ndarray, c: np.ndarray, params: Any) -> dict[str, float]:
-        """What makes an episode easy or hard, by name and unit, of its initial state (8,) and constants (nc,).
+        """Quantities that make an episode easy or hard, by name and unit, from its initial state (8,) and constants (nc,).
 
-        Evaluation bins its results by each of these. The default is the constants; a task overrides it where derived
-        quantities say more.
+        Evaluation reports its results by ranges of each quantity. The default is the constants; a task overrides it if
+        other quantities describe the difficulty better.
         """
         return dict(zip(self.constant_names, map(float, c), strict=True))
 
@@ -217,7 +217,7 @@ class Task(ABC):
 
     @abstractmethod
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """Success iff every entry ≤ 0: at the first such state if `first_exit`, else at the end of the episode."""
+        """Numbers that are all ≤ 0 in the goal: at the first such state if `first_exit`, else at the end of the episode."""
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: Any) -> Reference:
         """The steady motion that linear control steers to from state x; default, the robot's rest."""
@@ -238,8 +238,8 @@ class Task(ABC):
         return [((1 - share) * x + share * target.x[-1], np.repeat(target.u[-1:], self.steps, axis=0))]
 
     def search_cases(self, episode: Any) -> list[Any] | None:
-        """What a search of the task's own finds, which replaces that from `guesses`: for motions that are not smooth, case by
-        case.
+        """Solutions of the task's own search, which replaces the search from `guesses`: for motions that are smooth only
+        case by case.
 
         Args:
             episode: the problem, a `ballbot_baselines.solvers.shooting.Shooting`.
@@ -289,11 +289,14 @@ class Task(ABC):
         return len(self.observation_scale) + len(params.OUTPUTS)
 
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """What optimizers keep ≥ 0, as `margin_names` names it."""
+        """Numbers, named in `margin_names`, that optimizers keep ≥ 0, such as the distance to an obstacle."""
         return ()
 
     def limits(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """Safe iff every entry ≥ 0, as `limit_names` names it: the margins, and limits that optimizers do not need."""
+        """Numbers, named in `limit_names`: a negative one is a failure.
+
+        They are the margins, and limits that no optimum comes near, so that optimizers do not need them.
+        """
         return self.margins(x, c)
 
     def violated(self, x: Vector, c: Vector) -> str:

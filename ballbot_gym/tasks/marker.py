@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Marker:
     """An upright cylinder on the floor, with `radius` and `height` in m.
 
-    A `ring` is drawn as its circumference only.
+    If `ring` is true, only its circumference is drawn.
     """
 
     position: tuple[float, float]

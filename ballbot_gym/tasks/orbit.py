@@ -30,7 +30,7 @@ class Orbit(BallbotTask):
     | 4, 5 | ball velocity ẋ, ẏ | 5 | m/s |
     | 6, 7 | lean rate γ̇, θ̇ | 5 | rad/s |
     | 8 | radius error (x² + y² − r²) / 2r | 1 | m |
-    | 9, 10 | velocity error, ball velocity less (v/r)(−y, x) | 5 | m/s |
+    | 9, 10 | velocity error: ball velocity minus (v/r)(−y, x) | 5 | m/s |
     | 11 | radius r | 3 | m |
     | 12 | speed v | 5 | m/s |
 
@@ -48,8 +48,8 @@ class Orbit(BallbotTask):
     Cost rate: 10 e_r² + 2 |e_v|² + 0.02 (γ̇² + θ̇²) + 2e-5 (Fx² + Fy²), with e_r and e_v the errors observed.
 
     Ends: tilt beyond `max_tilt` fails, and so does leaving the arena.
-    After `duration` the episode is truncated, a success if the ball is then within
-    0.2 m of the circle and a fifth of v of its velocity.
+    After `duration` the episode is truncated. It is a success if the ball is then within 0.2 m of the circle and its
+    velocity error is less than a fifth of v.
 
     Arguments, each a keyword of `gymnasium.make`:
 

@@ -36,11 +36,11 @@ class Stabilize(BallbotTask):
     Start: |x|, |y| ≤ `start_position`, |ẋ|, |ẏ| ≤ `start_speed`, |γ|, |θ| ≤ `start_lean`, |γ̇|, |θ̇| ≤ `start_lean_rate`,
     uniform.
 
-    Cost rate: x² + y² + ½(γ² + θ² + ẋ² + ẏ² + γ̇² + θ̇²) + 5e-4 (Fx² + Fy²), the paper's shape of weights.
+    Cost rate: x² + y² + ½(γ² + θ² + ẋ² + ẏ² + γ̇² + θ̇²) + 5e-4 (Fx² + Fy²). The ratios of the weights are the paper's.
 
     Ends: tilt beyond `max_tilt` fails, and so does leaving the arena.
-    After `duration` the episode is truncated, a success if the robot then stands
-    within 0.1 m of the origin, slower than 0.1 m/s, leaning less than 2° and turning slower than 0.1 rad/s.
+    After `duration` the episode is truncated. It is a success if the robot is then within 0.1 m of the origin, slower than
+    0.1 m/s, with a lean below 2° and a lean rate below 0.1 rad/s.
 
     Arguments, each a keyword of `gymnasium.make`:
 
@@ -126,7 +126,7 @@ class Stabilize(BallbotTask):
 
 
 def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
-    """≤ 0 iff within 0.1 m of a point, slower than 0.1 m/s, tilted < 2° and turning slower than 0.1 rad/s."""
+    """Numbers that are all ≤ 0 within 0.1 m of a point, below 0.1 m/s, 2° of tilt and 0.1 rad/s of lean rate."""
     px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
     return (
         squared(px - x_goal, py - y_goal) / 0.1**2 - 1,

@@ -30,7 +30,7 @@ class Turn(BallbotTask):
     |---|---|---|---|
     | 0, 1 | ball position relative to the gate | 5 | m |
     | 2, 3 | lean γ, θ | 1 | rad |
-    | 4, 5 | ball velocity less the gate's (v, 0) | 5 | m/s |
+    | 4, 5 | ball velocity minus the gate's velocity (v, 0) | 5 | m/s |
     | 6, 7 | lean rate γ̇, θ̇ | 5 | rad/s |
     | 8 | speed v | 5 | m/s |
 
@@ -44,16 +44,18 @@ class Turn(BallbotTask):
 
     Cost rate: 5 + ½(γ² + θ² + γ̇² + θ̇²) + 2e-4 (Fx² + Fy²): time, lean and effort, as in the paper's problem 1.
 
-    Ends: within 0.2 m of the gate, 0.5 m/s of its velocity, tilt < 10° and lean rate < 1 rad/s at once: success, and no
-    further cost. Tilt beyond `max_tilt` fails, and so does leaving the arena. After `duration` the episode is truncated.
+    Ends: the episode ends with success, and without further cost, when the ball is within 0.2 m of the gate, its velocity
+    is within 0.5 m/s of (v, 0), the tilt is below 10° and the lean rate below 1 rad/s. Tilt beyond `max_tilt` fails, and so
+    does leaving the arena. After `duration` the episode is truncated.
 
-    Discount: use 0.99 to 0.995, or count time-outs as ends. Arriving pays the survival reward of the remaining time at once.
-    A learner that bootstraps time-outs values standing still as if it continued indefinitely. The certified turns are then
-    worth 36 to 363 more than standing still with a discount of 0.99, 17 to 283 more with 0.995, and 211 to 366 less with
-    0.998. If time-outs count as ends, turning is worth more with each of these discounts, and 8 to 35 more without discount.
+    Discount: use 0.99 to 0.995, or treat time-outs as terminations. Arriving pays the survival reward of the remaining time
+    at once, while a learner that bootstraps at time-outs values standing still as if it continued indefinitely. For such a
+    learner, the certified turns have a value that is 36 to 363 higher than that of standing still with a discount of 0.99,
+    17 to 283 higher with 0.995, and 211 to 366 lower with 0.998. If time-outs are terminations, turning has the higher value
+    with each of these discounts, and a value that is 8 to 35 higher without discount.
 
     Survival reward: full force on both axes costs 49 /s, time 5 /s, leans at most 2 /s, and lean rates of 5 rad/s 25 /s. So
-    nearly every step costs less than the 100 /s that it pays.
+    nearly every step costs less than the survival reward of 100 /s.
 
     Arguments, each a keyword of `gymnasium.make`:
 

@@ -47,15 +47,15 @@ class Weave(BallbotTask):
     | obstacle{i}_x, _y | centre of obstacle i | m | at least 1 m from the next along x |
     | obstacle{i}_radius | | m | [0.25, 0.45]; set to any > 0 |
 
-    Obstacles are numbered along the way, and alternate about the straight line; unused numbers repeat the last one.
+    Obstacles are numbered from start to goal, on alternating sides of the straight line; unused numbers repeat the last one.
 
     Start: at rest, upright, at (0, y) with |y| ≤ 0.3 m.
 
-    Cost rate: as Stabilize's, about the goal.
+    Cost rate: that of Stabilize, relative to the goal.
 
     Ends: touching an obstacle with the ball, tilt beyond `max_tilt` or leaving the arena fails.
-    After `duration` the episode is truncated,
-    a success if the robot then rests at the goal by Stabilize's tolerances.
+    After `duration` the episode is truncated. It is a success if the robot then rests at the goal, with the tolerances of
+    Stabilize.
 
     Arguments, each a keyword of `gymnasium.make`:
 

@@ -68,9 +68,9 @@ class BatchStep(NamedTuple):
     observation: torch.Tensor
     """(B, no) observations. Where an episode ended, the first one of the next episode."""
     reward: torch.Tensor
-    """(B,) of the step: survival_reward · control_dt less the running cost, and the pay of a first exit; see `Task`."""
+    """(B,) reward of the step: survival_reward · control_dt minus the running cost, plus the reward at a first exit."""
     cost: torch.Tensor
-    """(B,) of the step, a failure's price included."""
+    """(B,) cost of the step, the price of a failure included."""
     terminated: torch.Tensor
     """(B,) bool."""
     truncated: torch.Tensor

@@ -95,16 +95,16 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             render_mode: None or "rgb_array", which draws every env in turn.
             autoreset_mode: an `AutoresetMode`, or its value; default, SAME_STEP.
             physics: "rk4". Gymnasium's own vector envs run the others.
-            max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
-                Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
-            engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
-                once per task and machine. It needs CasADi, gives no gradients, and does not support `Randomization`, history
-                or sensors. Wheels of some systems have that code of the shipped tasks and robots, and then it needs neither
-                compiler nor CasADi. "torch" computes them in torch, and `compile` says whether that is compiled. "numpy"
-                needs nothing else, supports what "native" supports, and is the slowest. "auto" takes "native" on a CPU if it
-                supports the arguments and compile is neither True nor False. Otherwise it takes "torch", or "numpy" if
-                torch is not installed. All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch`
-                or a `BallbotArrays`.
+            max_episode_steps: control steps after which an episode is truncated, as by Gymnasium's `TimeLimit` in
+                `gymnasium.make`. Unlike the task's `duration`, it changes neither rewards nor the goal.
+            engine: "native" computes all envs at once in machine code, which is compiled within a second or two, once per
+                task and machine. It needs CasADi and a C compiler, but not for the shipped tasks and robots if the
+                installed wheel has their code. It gives no gradients, and does not support `Randomization`, history or
+                sensors. "torch" computes the envs in torch; `compile` says whether this code is compiled. "numpy" needs
+                nothing else, supports what "native" supports, and is the slowest. "auto" uses "native" on a CPU if it
+                supports the arguments and compile is neither True nor False. Otherwise it uses "torch", or "numpy" if
+                torch is not installed. All engines run the same episodes, to rounding. The attribute `batch` is a
+                `BallbotNative`, a `BallbotBatch` or a `BallbotArrays`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as

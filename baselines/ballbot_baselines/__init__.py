@@ -1,7 +1,7 @@
 """Model-based experts: linear control, trajectory optimization, and the optima that regret is measured against.
 
-`from ballbot_baselines import find_optimum` and the like are short paths to what users need. Importing this package is light:
-CasADi and SciPy are imported at the first use of one of these names, or when a controller is made.
+Everything that users need is imported from here: `from ballbot_baselines import find_optimum`. Importing this package is
+fast: CasADi and SciPy are imported at the first use of one of these names, or when a controller is made.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ CONTROLLERS: dict[str, Callable[[Task, Robot], Controller]] = {
     "trajopt": called("ballbot_baselines.feedback.trajopt:TrajoptController"),
     "nmpc": called("ballbot_baselines.feedback.nmpc:NmpcController"),
 }
-"""Every controller by its name on the command line. To add a controller, write one file and add one line here."""
+"""Every controller by its name on the command line. To add a controller to the package, write its file and a line here."""
 
 _ADAPTIVE = called("ballbot_baselines.feedback.adaptive:AdaptiveNmpcController")
 VARIANTS: dict[str, Callable[[Task, Robot], Controller]] = {
@@ -44,10 +44,10 @@ VARIANTS: dict[str, Callable[[Task, Robot], Controller]] = {
     "nmpc-ekf": partial(_ADAPTIVE, ending="-ekf"),
     "nmpc-adaptive-ekf": partial(_ADAPTIVE, ending="-adaptive-ekf"),
 }
-"""Controllers that run where they are named. They have no row on the leaderboard."""
+"""Controllers that commands run only if they are named. They have no row on the leaderboard."""
 
 FILTERS = ("-adaptive-ekf", "-ekf", "-adaptive")
-"""What may follow the name of a controller, and puts a filter in front of it; see `adaptive`."""
+"""Endings of a controller's name that put a filter in front of it, as in "lqr-ekf"; see `feedback.adaptive`."""
 
 __all__ = [
     "CONTROLLERS",

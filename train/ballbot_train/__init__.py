@@ -1,17 +1,17 @@
 """Training, evaluation and the command line `ballbot`.
 
-Everything that users need is imported from here, and each name imports what it needs when it is first used:
+Everything that users need is imported from here. A module is imported only when one of its names is first used:
 
 | name | what it is |
 |---|---|
-| `evaluate` | the leaderboard row of anything that acts |
-| `evaluate_fresh` | thousands of fresh episodes of a policy |
-| `load_policy` | a policy file as a Controller with `predict` |
+| `evaluate` | measures any policy or controller on the certified episodes, and returns its row for the leaderboard |
+| `evaluate_fresh` | measures a policy on thousands of fresh episodes |
+| `load_policy` | loads a policy file as a Controller with `predict` |
 | `shipped_policies` | the policies that come with the package |
-| `export_onnx` | a policy file as ONNX |
+| `export_onnx` | writes a policy as an ONNX file |
 | `BallbotVecEnv`, `RslVecEnv` | batched environments for Stable-Baselines3 and rsl-rl |
 | `RegretWrapper` | adds the regret of every episode to its `info` |
-| `RegretCallback` | the regret of an SB3 model while it trains |
+| `RegretCallback` | measures the regret of a Stable-Baselines3 model while it trains |
 | `Playground` | the simulation behind `ballbot play`, for scripts |
 | `certified_replay` | certified episodes of several controllers in one picture in 3D |
 """

@@ -252,7 +252,7 @@ class SensorFilter:
 
 
 class StateFromSensors(gymnasium.Wrapper):
-    """Shows a policy the observation of the state that `SensorFilter` estimates, in an env that shows sensors."""
+    """Wrapper of an env that observes sensors: it returns the observation of the state that `SensorFilter` estimates."""
 
     def __init__(self, env: gymnasium.Env):
         """Args: env: a `BallbotEnv` with observation="sensors" and without history, wrapped or not."""

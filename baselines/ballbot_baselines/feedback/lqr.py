@@ -45,12 +45,12 @@ class LqrController:
     """LQR about the task's reference motion, with weights from the task's own cost.
 
     About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
-    gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one,
-    with forces that look ahead, because it may be no motion of the robot.
+    gain is periodic, and the gain of the nearest point of the reference is used. The reference of a task with a clock is
+    open. Because the robot may be unable to follow it exactly, the forces take the later part of it into account.
 
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
 
-    `reset` raises a PlanError where the reference is a single point that is no equilibrium.
+    `reset` raises a PlanError if the reference is a single point that is not an equilibrium.
     """
 
     def __init__(self, task: Task, params: Robot):

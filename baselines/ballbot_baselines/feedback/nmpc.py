@@ -64,15 +64,15 @@ class _Counts:
 class NmpcController:
     """Model predictive control about the episode's plan. One iteration per control step by default (real-time iteration).
 
-    A step whose program fails follows the last plan under TVLQR: the last solution, shifted, plus the episode plan's gain
-    times the distance from it.
+    If the quadratic program of a step fails, the step follows the last plan under TVLQR: the last solution, shifted, plus the
+    gain of the episode's plan times the distance from this solution.
 
     | attribute | meaning |
     |---|---|
     | `plan` | the episode's plan; None before the first `reset`, which raises a PlanError where there is no plan |
     | `disturbance` | the estimate of how the robot differs from the model, if `offset_free`; else None |
-    | `backoff` | how far its plans keep from their limits |
-    | `counts` | what happened so far |
+    | `backoff` | the distance that its plans keep from their limits |
+    | `counts` | numbers of steps, iterations and failures so far |
     """
 
     def __init__(
@@ -88,15 +88,15 @@ class NmpcController:
         """Builds the program; `reset` does the planning.
 
         Args:
-            nodes: intervals of the horizon, at most one per control step; default 40, or one per control step where friction
-                is limited, because forces follow the friction cone from step to step.
-            horizon: s, whole control steps.
-            iterations: most iterations per step: 1 is the real-time iteration, some 20 converge.
-            backoff: how far the plan keeps from its limits; the horizon's margins keep half of it.
+            nodes: intervals of the horizon, at most one per control step; default 40, or one per control step if friction is
+                limited, because the optimal forces then change from step to step along the friction cone.
+            horizon: s, a whole number of control steps.
+            iterations: largest number of iterations per control step: 1 is the real-time iteration; about 20 converge.
+            backoff: distance of the plan from its limits; within the horizon, margins keep half of it.
             offset_free: whether to estimate how the robot's accelerations differ from the model's, and to correct the model.
 
         Raises:
-            ValueError: a horizon that is no whole number of control steps, or of fewer than 2.
+            ValueError: the horizon is not a whole number of control steps, or has fewer than 2.
         """
         self._task, self._params, self.backoff = task, params, backoff
         self._iterations, self._offset_free = iterations, offset_free

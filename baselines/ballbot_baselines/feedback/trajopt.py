@@ -21,8 +21,8 @@ _CAUTIOUS = Backoff(margin=0.03, goal=0.5, force=1 - _LEAST_FORCE, grip=0.1)
 class TrajoptController:
     """Plans the optimum from the state at reset, with a back-off from the limits, and tracks it with TVLQR.
 
-    A plan that is feasible and not optimal is tracked too. `plan` is the last plan. `reset` raises a PlanError if it finds no
-    plan.
+    If the solver does not converge, a plan that is only feasible is tracked. `plan` is the plan of the episode. `reset`
+    raises a PlanError if it finds no plan.
     """
 
     def __init__(self, task: Task, params: Robot, backoff: Backoff = EXECUTED):
@@ -39,13 +39,13 @@ class TrajoptController:
 
 
 def optimal_trajopt(task: Task, params: Robot) -> TrajoptController:
-    """`TrajoptController` of the optimum itself, without a back-off: what regret is measured against, as a controller."""
+    """`TrajoptController` without a back-off: it tracks the optimum itself, against which regret is measured."""
     return TrajoptController(task, params, Backoff())
 
 
 def cautious_trajopt(task: Task, params: Robot) -> TrajoptController:
     """`TrajoptController` for the nominal robot with the least force and friction of the track "unknown".
 
-    Its plans leave force and room for feedback on all robots of that track.
+    Its plans leave enough force for feedback, and enough distance from the limits, on all robots of that track.
     """
     return TrajoptController(task, params.varied(friction=_LEAST_FRICTION), _CAUTIOUS)

@@ -11,7 +11,8 @@ from ballbot_gym.trajectory import Trajectory
 class TvlqrController:
     """Tracks a trajectory sampled at control steps: u = u_k − K_k (x − x_k).
 
-    Past the trajectory's end its last state is held by the last gain, which is LQR's where that state is an equilibrium.
+    After the end of the trajectory, the last gain keeps the robot at its last state. If that state is an equilibrium, the
+    gain is that of LQR.
     """
 
     def __init__(self, trajectory: Trajectory, dt: float, gains: Gains, end_gain: np.ndarray | None = None):
@@ -21,7 +22,7 @@ class TvlqrController:
             trajectory: what to track.
             dt: s, the control step.
             gains: for each of the trajectory's n steps.
-            end_gain: (2, 8) for what comes after the end; default, the last of the trajectory's.
+            end_gain: (2, 8) gain after the end; default, the last gain of the trajectory.
         """
         self.x, self.u = held_steps(trajectory, dt)
         self.gains = gains

@@ -44,26 +44,27 @@ def find_optimum(
     start: float = 0.0,
     twice: bool | Optimum = False,
 ) -> Optimum:
-    """The cheapest episode from state x0 with constants c.
+    """The optimum of an episode: the motion with the lowest cost from state x0 with constants c.
 
     Args:
         task: the problem, or its name in `TASKS`.
         params: the robot, or its name in `ROBOTS`.
         x0: (8,) initial state, m, rad, m/s, rad/s; order in `Ballbot.STATE`; (11,) with wheels.
         c: (nc,) constants of the episode, named in the task's `constant_names`; (0,) where it has none.
-        backoff: distance kept from limits; none for the true optimum.
-        guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
-            those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
+        backoff: distance from the limits that the motion keeps; default, none, for the true optimum.
+        guesses: largest number of the task's guessed paths to solve. For a slalom, the costs of all choices of sides are
+            predicted by `sides.predict`, and the likely ones are solved; `ALL_GUESSES` solves every one.
         paths: ground paths to start from instead of the task's, (n+1, 2) each, m, one point for each control step.
         start: the episode's time at x0, s: the trajectory's times begin there. It matters to tasks with a clock.
-        twice: whether the search of many episodes at once searches too, where it can, or what `find_optima` found for this
-            episode. It starts from other guesses, and finds something cheaper in about one episode of a hundred.
+        twice: whether the search of `find_optima` is run too, if it supports the problem; or its result for this episode.
+            It starts from other guesses, and finds a motion of lower cost in about one episode of a hundred.
 
     Returns:
-        The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
+        The optimum with the lowest cost that was found. If no try converged, the feasible motion with the lowest cost; look
+        at `status`.
 
     Raises:
-        PlanError: no try came to a feasible episode.
+        PlanError: no try led to a feasible motion.
         ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
     """
     task, params = make_task(task, params), checked_robot(params)
@@ -110,11 +111,11 @@ def find_optima(
     backoff: Backoff = Backoff(),
     guesses: int = CONSIDERED,
 ) -> list[Optimum | None]:
-    """The cheapest episodes from B states x0 with constants c, thousands at once on one core: `find_optimum` for many.
+    """The optima of B episodes from states x0 with constants c, thousands at once on one core.
 
-    They are solved together where C code can be compiled, and the task has no clock, and the robot no wheels. That takes a
-    few milliseconds each, and leaves some episodes unsolved, which `find_optimum` may solve. Elsewhere `find_optimum` solves
-    one after the other.
+    The episodes are solved together if C code can be compiled, the task has no clock, and the robot has no wheels. This takes
+    a few milliseconds per episode, and leaves some episodes unsolved, which `find_optimum` may solve. Otherwise
+    `find_optimum` solves one episode after the other.
 
     Args:
         task: the problem, or its name in `TASKS`.

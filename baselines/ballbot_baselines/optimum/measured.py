@@ -30,10 +30,11 @@ class Regret:
     | `success` | whether the episode reaches its goal |
     | `violated` | the limit whose violation ended the episode, or "" |
     | `duration` | of the episode, s |
-    | `defects` | (N, 8) recorded states less what the robot's equations make of the ones before, SI units |
+    | `defects` | (N, 8) recorded states minus the states that the robot's equations predict from the ones before, SI units |
     | `force_excess` | by how much the largest recorded force exceeds the force limit, N; 0 if none does |
 
-    Defects of an optimum are below 1e-6. Where they are not small, the regret is of a motion that this robot cannot do.
+    Defects of an optimum are below 1e-6. If they are not small, this robot cannot perform the motion, and the regret has no
+    meaning.
     """
 
     regret: float

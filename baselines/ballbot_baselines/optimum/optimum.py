@@ -18,19 +18,19 @@ def _no_feedback() -> np.ndarray:
 
 @dataclass(frozen=True, repr=False)
 class Optimum(Moving):
-    """The best episode found: its cost, its trajectory, and what the solver said of it.
+    """The best motion that a search found: its cost, its trajectory, and how the solver ended.
 
     | field | meaning |
     |---|---|
     | `cost` | of the whole episode, or of the paper's problem |
     | `trajectory` | of n control steps with forces held; the paper's problems have linear forces |
-    | `status` | "optimal" if the solver converged, else "feasible": it obeys every constraint, but may not be the cheapest |
-    | `solver_status` | the solver's own word |
+    | `status` | "optimal" if the solver converged, else "feasible": within all limits, but its cost may not be minimal |
+    | `solver_status` | how the solver ended, in its own words |
     | `violation` | largest amount by which a constraint is missed, SI units |
     | `iterations` | of the solver; 0 where it does not count them |
     | `solver` | "fatrop", "ipopt", "ilqr", or "simulation" |
     | `seconds` | wall time of the whole search; of many episodes, the share of one |
-    | `slopes` | (n+1, 8) slopes of the remaining cost with respect to x_0 … x_n |
+    | `slopes` | (n+1, 8) derivatives of the cost to go with respect to x_0 … x_n |
     | `markers` | what the task draws |
     | `gains` | (n, 2, 8) K of the feedback u − K (x' − x) about the optimum, N per unit of the state |
 

@@ -38,20 +38,20 @@ _checked: set[tuple[Task, Kind]] = set()
 class Backoff:
     """How far a plan stays from its limits, so that a controller that tracks it stays within them.
 
-    The defaults make up for the solvers' tolerance, so that optimal forces and states obey the limits exactly.
+    The defaults are as large as the solvers' tolerance, so that optimal forces and states are exactly within the limits.
 
     Raises:
         ValueError: a field is negative or not finite, or a fraction is not below 1.
     """
 
     margin: float = 1e-7
-    """From margins, in their unit."""
+    """Distance from margins, in their unit."""
     goal: float = 1e-6
     """Share of the goal's tolerance."""
     force: float = 1e-7
     """Share of the force limit."""
     grip: float = 1e-5
-    """Share of the weight, of the normal force."""
+    """Reserve of normal force, as a share of the weight."""
 
     def __post_init__(self) -> None:
         for name, below in (("margin", math.inf), ("goal", 1.0), ("force", 1.0), ("grip", 1.0)):

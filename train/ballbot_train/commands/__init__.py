@@ -22,7 +22,7 @@ MOVED = {"tune": "`ballbot tune` is an example now: python examples/tune.py --ta
 """What to do instead of commands of earlier versions."""
 
 RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train")
-"""Those that continue where they were interrupted; `train` does it with --resume."""
+"""Commands that continue an interrupted run when they are started again; `train` does it with --resume."""
 
 
 def help_of(name: str) -> str:

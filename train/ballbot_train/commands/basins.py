@@ -1,4 +1,4 @@
-"""`ballbot basins`: the states that each controller recovers from, and those that any controller could."""
+"""`ballbot basins`: the states that each controller recovers from, and the states from which recovery is possible at all."""
 
 from pathlib import Path
 
@@ -23,16 +23,16 @@ def basins(
     robot: RobotName = PAPER,
     filter: Filter | None = None,
 ) -> None:
-    """Maps the leans, speeds and lean rates in Stabilize that each controller recovers from, within the robot's limits.
+    """Maps the leans, speeds and lean rates of Stabilize from which each controller recovers, where recovery is possible.
 
     Args:
         controllers: same as in `ballbot benchmark`.
-        points: along each axis of a map; odd.
+        points: number of states along each axis of a map; odd.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
-        workers: who does the work.
+        workers: where the work is done.
         robot: name of the robot, with its limits and controllers.
-        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
+        filter: filter in front of every controller: it estimates the robot, the delay, or the state from sensors.
     """
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")

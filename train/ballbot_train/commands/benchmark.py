@@ -35,18 +35,18 @@ def benchmark(
 
     Args:
         tasks: names of tasks.
-        controllers: names of experts and policies, or files of policies; default all experts and all policies that come
-            with the package. A policy is run on the task it was made for.
-        episodes: how many of each task's certified episodes.
+        controllers: names of experts and policies, or files of policies; default, all experts and all policies that come
+            with the package. A policy runs only on the task that it was trained for.
+        episodes: number of certified episodes of each task, from the first.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        seed: of the bootstrap intervals, and of everything that an episode draws.
+        seed: seed of the bootstrap intervals, and of noise and pushes in the episodes.
         out: folder of the results; an interrupted run continues here.
-        workers: where the work is done; one process gives the cleanest times per control step.
+        workers: where the work is done; with one process, other processes disturb the measured times least.
         robot: name of the robot, with its episodes and controllers; default, the robot that each task names.
-        randomization: names of tracks, "unknown", "late", "noisy" or "real". Their robots, delays and sensors are hidden from
-            the controllers. The result is then one table of controllers by tracks, with the parts of their regret. By default
-            the experts that are made for each track run.
-        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
+        randomization: names of tracks, "unknown", "late", "noisy" or "real". Their robots, delays and sensor errors are
+            hidden from the controllers. The result is then one table of controllers by tracks, with the parts of their
+            regret, and the default controllers are the experts for each track.
+        filter: filter in front of every controller: it estimates the robot, the delay, or the state from sensors.
     """
     made_for = controllers_of(tasks, controllers, [robot], filter, tracks=bool(randomization))
     chosen = made_for[robot]

@@ -33,18 +33,18 @@ def certify(
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
-    Every optimum is stored in the user's cache folder when it is found. Evaluations read the optima that the package lacks
-    from there.
+    Every optimum is stored in the user's cache folder as soon as it is found. Evaluations read from there the optima that
+    do not come with the package.
 
     Args:
         tasks: names of tasks.
-        episodes: how many, from the first.
+        episodes: number of episodes, from the first.
         shards: URL or folder for a set of shards, SHARDS/TASK, instead of the .npz files; for more episodes than fit into
             memory. See `ballbot_train.work.shards`.
         out: folder of the .npz files.
-        workers: who does the work.
+        workers: where the work is done.
         robot: name of the robot; default, the robot that each task names.
-        randomization: name of the track that each episode's robot and delay are drawn from; default, none.
+        randomization: name of the track that draws the robot and the delay of each episode; default, none.
     """
     check_names("task", tasks, TASKS, least=1)
     check_least(1, episodes=episodes)

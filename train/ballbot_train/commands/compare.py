@@ -21,10 +21,10 @@ def compare(
 
     Args:
         a: folder of a benchmark, or its leaderboard.json; or the name of a row of the leaderboard, such as lqr.
-        b: the other.
-        match: a controller of A and one of B, to compare controllers of different names.
-        training_margin: between policies with different weights, smaller differences of success and regret decide nothing,
-            because another training seed changes as much; 0.02 is 2 %. Between other controllers 0.1 % decides.
+        b: the same for the other result.
+        match: a controller of A and one of B, to compare controllers that have different names.
+        training_margin: smallest difference of success or regret that counts between policies with different weights, because
+            another training seed can change them by as much; 0.02 is 2 %. Between other controllers 0.1 % counts.
     """
     runs = _read(a), _read(b)
     compared = comparison.compare(runs[0], runs[1], match, training_margin)

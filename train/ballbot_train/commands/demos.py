@@ -19,14 +19,14 @@ def demos(
     out: Path | None = None,
     workers: WorkersOption = Workers(),
 ) -> None:
-    """Records episodes of an expert with exploration as a Minari dataset; a killed run continues when started again.
+    """Records episodes of an expert, with exploration noise, as a Minari dataset. Started again, a killed run continues.
 
     Args:
         config: what is recorded.
         shards: URL or folder for a set of shards instead of a Minari dataset, for more episodes than fit into memory; see
             `ballbot_train.work.shards`.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
-        workers: who does the work.
+        workers: where the work is done.
     """
     kind, folder = f"{file_name(config.task, config.robot)}-{config.expert}", Path("runs") / "demos"
     if shards is not None:

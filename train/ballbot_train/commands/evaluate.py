@@ -50,24 +50,24 @@ def evaluate(
     randomization: str | None = None,
     filter: Filter | None = None,
 ) -> None:
-    """Runs a controller on the certified episodes; or with --fresh on thousands of fresh ones, with all that failed.
+    """Runs a controller on the certified episodes; or with --fresh on thousands of fresh ones, to find rare failures.
 
     Args:
         policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a controller that comes
             with the package.
-        task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
-        episodes: how many of the certified episodes.
-        fresh: instead of certified episodes, how many fresh ones, in the batched closed-form model.
-        physics: of certified episodes: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        seed: of the fresh episodes, or of the bootstrap intervals and of whatever a certified episode draws.
-        optima: of how many fresh episodes, from the first, the optimum is found too, for their regret; default the first
-            100, and none where --randomization varies what optima depend on. Optima stay in the user's cache folder, for
-            later calls and other policies.
+        task: name of the task; default, the one that the file of the policy names or whose observations fit, else stabilize.
+        episodes: number of certified episodes, from the first.
+        fresh: number of fresh episodes to run instead of certified ones, all at once in the batched closed-form model.
+        physics: engine for certified episodes, "bullet", "mujoco" or "rk4"; default, the first that is installed.
+        seed: seed of the fresh episodes; or of the bootstrap intervals, and of noise and pushes in certified episodes.
+        optima: number of fresh episodes, from the first, for which the optimum is computed too, so that they have a regret;
+            default 100, or none if --randomization varies what optima depend on. Optima are stored in the user's cache
+            folder, for later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
-        workers: who runs certified episodes, and finds optima.
-        robot: whose episodes; default, the robot that the task names.
-        randomization: name of the track on which the episodes are, of robots and delays that are hidden from the policy.
-        filter: in front of the policy: it acts on what this estimates of the robot, the delay or, of sensors, the state.
+        workers: where certified episodes run and optima are computed.
+        robot: name of the robot, with its episodes; default, the robot that the task names.
+        randomization: name of a track, whose robots, delays and sensor errors are hidden from the policy.
+        filter: filter in front of the policy: it estimates the robot, the delay, or the state from sensors.
     """
     varied = checked_randomization(randomization)
     robot = robot if task is None else own_robot(task, robot)

@@ -22,18 +22,18 @@ def export(
 ) -> None:
     """Writes a policy as an ONNX or a C file, which needs neither Python nor torch to run.
 
-    An ONNX file takes the observation, and gives the action in [-1, 1]. Its metadata names the task, the units, the layout
-    and the control rate. A C file is C99 for microcontrollers, without malloc. It holds the observation too, the same facts
-    as a comment, and a test of itself.
+    An ONNX file computes the action in [-1, 1] from the observation. Its metadata names the task, the units, the layout
+    and the control rate. A C file is C99 for microcontrollers, without malloc. It also computes the observation from the
+    state, has the same facts in a comment, and can test itself.
 
     Args:
         policy: a policy file, or the name of a policy that comes with the package; for C also lqr.
-        task: name of its task; default the one that its file names, or else stabilize.
+        task: name of the task; default, the one that the file of the policy names, else stabilize.
         format: onnx or c.
         out: path of the file; default runs/export/TASK-POLICY with the ending .onnx or .c.
         robot: name of the policy's robot.
-        prefix: how the names in a C file begin; give each controller of one program another.
-        filter: ekf, for C of a robot with wheels: the file then takes what the robot's sensors show.
+        prefix: beginning of all names in a C file; if one program contains several controllers, give each its own.
+        filter: ekf, for a robot with wheels and C only: the file then computes the state from the robot's sensor readings.
     """
     policy = behind(policy, filter)
     filtered = split(policy)[1] == "ekf" and format == "c" and bool(named_robot(robot).SENSORS)

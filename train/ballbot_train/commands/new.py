@@ -39,9 +39,9 @@ def new(kind: Kind, name: str, /, out: Path | None = None, episodes: int = 8) ->
 
     Args:
         kind: task or system.
-        name: of the task, and of the system: small letters, digits and underscores.
-        out: its folder; default the name.
-        episodes: of the first leaderboard; 0 for none.
+        name: name of the task, and of the system: small letters, digits and underscores.
+        out: folder of the package; default, the name.
+        episodes: number of episodes of the first leaderboard; 0 for no leaderboard.
     """
     check_name(name, kind)
     check_least(0, episodes=episodes)

@@ -31,10 +31,10 @@ def optimize(
         task: name of a task.
         state: x y γ θ ẋ ẏ γ̇ θ̇ at the start, in m, rad, m/s, rad/s; default drawn with the seed.
         constants: constants of the episode by name, e.g. --constants speed 3; others are drawn with the seed.
-        seed: of what is drawn.
+        seed: seed of what is drawn.
         duration: longest episode, s.
         out: folder of trajectory.npz and figure.png.
-        robot: by name.
+        robot: name of the robot.
     """
     check_names("task", [task], TASKS)
     check_least(0, seed=seed)

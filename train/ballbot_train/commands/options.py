@@ -12,7 +12,7 @@ Filter = Literal["adaptive", "ekf", "adaptive-ekf"]
 """The filters that --filter can put in front of controllers."""
 
 UNNAMED = tyro.conf.arg(name="")
-"""Of a dataclass whose fields are options of their own names."""
+"""Marks a dataclass whose fields become options without a prefix: `--task`, and not `--run.task`."""
 
 WorkersOption = Annotated[Workers, UNNAMED, tyro.conf.DisallowNone]
 """The options --workers and --ray of every command that does much work."""

@@ -7,7 +7,7 @@ from ballbot_train.work.console import console
 
 
 def page(policies: tuple[str, ...] = (), /, out: Path = Path("runs/page/playground.html")) -> None:
-    """Writes the playground as one HTML page: push a learned policy and LQR, without Python and without network.
+    """Writes the playground, on which you push robots under a policy and LQR, as one HTML page without Python or network.
 
     Args:
         policies: policy files; each replaces the shipped policy of its task on the page.

@@ -22,11 +22,11 @@ _GREY = (0.75, 0.75, 0.75, 1.0)
 
 
 def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
-    """Regenerates the paper's Figs 2 to 5: each optimum compared with its execution in PyBullet.
+    """Draws the paper's Figs 2 to 5 with solutions of this package: each plan, and the plan tracked in PyBullet.
 
     Args:
         out: folder of the figures and plans.
-        only: names of some of the problems; default all.
+        only: names of the problems to solve; default, all.
     """
     check_names("problem", list(only), PAPER_PROBLEMS)
     params, simulator = default_params(), PHYSICS_NAMES[physics_or_default(None)]

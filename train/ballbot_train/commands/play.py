@@ -28,17 +28,17 @@ def play(
     """Opens a page on which you push the robot, change it, and compare controllers.
 
     Args:
-        task: name of a task; default the one that the controller's file names or whose observations fit, or else stabilize.
-        controller: of the robot: an expert, a policy that comes with the package, a policy file, or a model saved
+        task: name of a task; default, the one that the controller's file names or whose observations fit, else stabilize.
+        controller: controller of the robot: an expert, a policy that comes with the package, a policy file, or a model saved
             by Stable-Baselines3 (.zip); default, the best shipped policy.
-        ghosts: controllers of further robots, with the same start and the same pushes.
-        episode: index of the certified episode it starts with, a random start, or at rest until a push that fells LQR;
-            default, at rest where all episodes of the task differ in their start alone, and else 0.
+        ghosts: controllers of further robots, which have the same start and get the same pushes.
+        episode: the index of a certified episode; a random start; or at rest, with a push after which LQR falls. Default, at
+            rest if the task's episodes have no constants, such as a goal or a speed, and else episode 0.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         robot: name of a robot.
-        seed: of random starts, noise and pushes.
-        port: where the page is, for this machine only; the next free one, if it is taken.
-        randomization: name of a track, as "unknown": every episode has a robot of it, which is hidden from the controllers.
+        seed: seed of random starts, noise and pushes.
+        port: port of the page, which only this machine can open; if it is taken, the next free one.
+        randomization: name of a track, such as "unknown": it draws a robot for every episode, hidden from the controllers.
     """
     task = task_name(controller or "", task, robot)
     robot = own_robot(task, robot)

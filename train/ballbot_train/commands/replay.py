@@ -37,7 +37,7 @@ def replay(
     frictions: tuple[float, ...] = (),
     filter: Filter | None = None,
 ) -> None:
-    """Draws a certified episode under controllers, or trajectory files: a strip of pictures, or a film.
+    """Draws a certified episode under one or several controllers, or trajectory files, as a strip of pictures or a film.
 
     Args:
         source: name of a task, or trajectory files (.npz).
@@ -51,10 +51,11 @@ def replay(
         speed: seconds of the episode per second of film; 0.5 is slow motion.
         width: width of a film, px; default 1280 for mp4, 640 for webp.
         out: folder of the file. The file is named after task, controllers and episode.
-        robot: whose episode; default, the robot that the task names; a trajectory file is drawn with the paper's.
-        frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of
-            them. Where the ball slips, its path is red.
-        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
+        robot: name of the robot, with its episodes; default, the robot that the task names. Trajectory files are drawn with
+            the paper's robot by default.
+        frictions: coefficients of friction, for a robot whose ball rolls: every controller is shown on each of these floors.
+            Where the ball slips, its path is red.
+        filter: filter in front of every controller: it estimates the robot, the delay, or the state from sensors.
     """
     _check(1 <= fps <= 1000, f"fps must be 1 to 1000, not {fps}")
     _check(1 <= frames <= 100, f"frames must be 1 to 100, not {frames}")

@@ -27,19 +27,19 @@ def robustness(
     robot: RobotName = PAPER,
     filter: Filter | None = None,
 ) -> None:
-    """Runs the certified episodes under pushes, noise, delay, lag and other robots, and draws success and regret by severity.
+    """Draws success and regret on the certified episodes against the severity of pushes, noise, delay, lag and other masses.
 
     Args:
         tasks: names of tasks.
         controllers: same as in `ballbot benchmark`; by default nmpc-offset-free, NMPC with a disturbance estimator, runs too.
         stresses: names of disturbances.
-        episodes: how many of each task's certified episodes.
+        episodes: number of certified episodes of each task, from the first.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        seed: of pushes, noise and the bootstrap intervals.
+        seed: seed of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
-        workers: who does the work.
-        robot: whose episodes and controllers.
-        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
+        workers: where the work is done.
+        robot: name of the robot, with its episodes and controllers.
+        filter: filter in front of every controller: it estimates the robot, the delay, or the state from sensors.
     """
     chosen = controllers_of(tasks, controllers, [robot], filter)[robot]
     if not controllers:

@@ -1,4 +1,4 @@
-"""`ballbot submit`: what a controller did in the certified episodes, as files for the leaderboard."""
+"""`ballbot submit`: the motions of a controller in the certified episodes, as files for the leaderboard."""
 
 from pathlib import Path
 
@@ -11,13 +11,13 @@ from ballbot_train.work.console import console
 def submit(
     results: Path, /, *, name: str, link: str = "", controller: str = "", out: Path = Path("submissions")
 ) -> None:
-    """Makes the submissions of a results folder, one small file per task, and verifies them.
+    """Packs recorded motions of a folder of results as submissions to the leaderboard, one file per task, and verifies them.
 
     Args:
         results: folder that evaluate(out=...) or `ballbot benchmark` wrote.
-        name: of the leaderboard's row.
+        name: name of the row in the leaderboard.
         link: address of a page about the controller; it begins with https://.
-        controller: which one, if the folder has several.
+        controller: name of the controller, if the folder has several.
         out: folder of the submissions.
     """
     packed = submissions.pack(results, name, link, controller)

@@ -42,19 +42,19 @@ class Run(Settings):
     demos: str | None = None
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Path | None = None
-    """Policy file to train on from."""
+    """Policy file from which training continues."""
     randomization: str | None = None
-    """Track: unknown, late, noisy or real; not sac."""
+    """Track to train for: unknown, late, noisy or real; not for sac."""
     history: int = number(0, 0)
-    """Number of earlier observations and actions that the policy observes."""
+    """Number of earlier observations and actions that are appended to each observation."""
     informed: bool = False
-    """The policy gets each robot's parameters, and runs behind a filter that estimates them."""
+    """The policy receives the true parameters of each robot in training, and the estimates of a filter afterwards."""
     threads: int = number(1, 1, 1024)
     """Threads of torch."""
     test_episodes: int = number(certified.EPISODES, 1, certified.EPISODES)
-    """Number of certified episodes that measure the chosen policy."""
+    """Number of certified episodes on which the chosen policy is measured."""
     validation_episodes: int = number(VALIDATION_EPISODES, 1, 100_000)
-    """Number of fresh episodes that decide which policy is kept."""
+    """Number of fresh episodes on which policies are compared, to choose the best one of the run."""
 
     @property
     def warm(self) -> bool:

@@ -47,21 +47,21 @@ def transfer(
     workers: WorkersOption = Workers(),
     filter: Filter | None = None,
 ) -> None:
-    """Runs controllers that were made for one robot on another: success, falls and cost over that robot's optimum.
+    """Runs controllers that were made for one robot on another: success, falls, and regret over the optimum of the latter.
 
     Args:
         tasks: names of tasks.
-        controllers: names of experts and policies; default all that the robots have.
+        controllers: names of experts and policies; default, all that the robots have.
         made_for: names of the robots that experts plan for and policies were trained on.
-        robot: what they run on, with its certified episodes.
+        robot: name of the robot that all of them run on, with its certified episodes.
         frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
-        episodes: how many of each task's certified episodes.
+        episodes: number of certified episodes of each task, from the first.
         physics: "bullet", "mujoco" or "rk4", where "rk4" has no contact between ball and floor; default, the first that is
             installed.
-        seed: of the bootstrap intervals.
+        seed: seed of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
-        workers: who does the work.
-        filter: in front of the controllers: they act on what it estimates of the robot, the delay or, of sensors, the state.
+        workers: where the work is done.
+        filter: filter in front of every controller: it estimates the robot, the delay, or the state from sensors.
     """
     check_names("robot", made_for, ROBOTS, least=1)
     for friction in frictions:

@@ -11,7 +11,7 @@ def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
     """Verifies submissions to the leaderboard from their motions, without the policy, and prints the row of each.
 
     Args:
-        files: of `ballbot submit`.
+        files: submissions, as `ballbot submit` writes them.
         write: folder into which each row is written as JSON, such as leaderboard.
     """
     if not files:

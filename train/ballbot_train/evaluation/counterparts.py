@@ -1,7 +1,7 @@
-"""Environments of other packages that are the very problem of a task: their policies, and their regret.
+"""Environments of other packages that pose the very problem of a task: their policies, and their regret.
 
-A task names such an environment as its `counterpart`. It draws the same episodes by seed, and costs are its returns: return +
-cost = `survival_pay` in both.
+A task names such an environment as its `counterpart`. Both draw the same episodes for the same seed, and return + cost =
+`survival_pay` in both.
 """
 
 import hashlib
@@ -24,10 +24,10 @@ from ballbot_train.evaluation import controllers
 
 
 class RegretWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
-    """Adds to the `info` of an episode's last step what the best policy would have earned from the same start.
+    """Adds the regret to the `info` of an episode's last step, with the return of the optimum from the same start.
 
-    It wraps an environment of this package, or a `counterpart` of a task, such as Gymnasium's "Pendulum-v1" where the package
-    `ballbot-classic` is installed. It belongs inside of wrappers that change rewards, such as `NormalizeReward`.
+    It wraps an environment of this package, or a `counterpart` of a task, such as Gymnasium's "Pendulum-v1" if the package
+    `ballbot-classic` is installed. Put it inside of wrappers that change rewards, such as `NormalizeReward`.
 
     | key | meaning |
     |---|---|

@@ -1,6 +1,6 @@
-"""`evaluate(policy, task)`: the leaderboard row of anything that acts, on the certified episodes of a task.
+"""`evaluate(policy, task)`: measures any policy or controller on the certified episodes of a task.
 
-Importing this module is light: torch is imported for policy files, CasADi for experts that plan, SciPy for intervals.
+Importing this module is fast: torch is imported only for policy files, CasADi for experts that plan, SciPy for intervals.
 """
 
 import math
@@ -74,29 +74,29 @@ def evaluate(
     filter: str | None = None,
     fresh: int | None = None,
 ) -> "Row | FreshResult":
-    """The leaderboard row of anything that acts, on certified episodes; or, with `fresh`, what it does on fresh episodes.
+    """Measures any policy or controller on certified episodes, and returns its row; or, with `fresh`, on fresh episodes.
 
-    Where the package has no optima of the task and the robot, they are computed, and kept in the user's cache. On a
-    terminal, a bar shows the episodes where they take longer than two seconds.
+    If the package has no optima of the task and the robot, they are computed and stored in the user's cache. On a terminal,
+    a progress bar appears if the episodes take longer than two seconds.
 
     Args:
         policy: see `as_controller`: a Stable-Baselines3 model, a function of the observation, a Controller, the name of a
             controller ("lqr", "trajopt", "nmpc") or a policy file.
         task: a name in `TASKS`, or any Task; or the id of a counterpart of a task, such as "Pendulum-v1" where the package
             `ballbot-classic` is installed: the policy then has the observations and actions of that environment.
-        episodes: how many of the certified episodes, from the first.
+        episodes: number of certified episodes, from the first.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        name: of the row; default, the policy's own.
+        name: name of the row; default, the policy's own.
         randomization: parameters hidden from the policy, or a name in `TRACKS`; default, none. Regret is measured against
             the optimum of each episode's own robot and delay, although the policy does not get them.
         robot: a name in `ROBOTS`, or any Robot.
-        workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
-            does: what it does must be under `if __name__ == "__main__"`.
+        workers: number of processes that compute optima; default, this process only. Other processes import the main script,
+            as in `multiprocessing`, so the script must do its work under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
-            Rows of other policies and tasks that are there already stay.
-        filter: the filter in front of the policy, "adaptive", "ekf" or "adaptive-ekf": the policy acts on what it estimates.
-        fresh: instead of certified episodes, the number of fresh ones: then this is `evaluate_fresh`, in the batched
-            closed-form model.
+            Rows of other policies and tasks that the folder already contains stay.
+        filter: filter in front of the policy, "adaptive", "ekf" or "adaptive-ekf": the policy acts on its estimates.
+        fresh: number of fresh episodes to run instead of certified ones. The result is then that of `evaluate_fresh`, in the
+            batched closed-form model.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes; or a randomization with an actuator that lags, under

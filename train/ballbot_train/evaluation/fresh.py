@@ -93,7 +93,7 @@ class FreshResult:
     constants: np.ndarray
     """(n, nc)."""
     costs: np.ndarray
-    """(n,) a failure's price included."""
+    """(n,) costs, the price of a failure included."""
     success: np.ndarray
     """(n,) bool."""
     failure: np.ndarray
@@ -169,7 +169,7 @@ class FreshResult:
         return rows
 
     def worst(self, count: int = 10) -> list[int]:
-        """The indices of the worst episodes: those without success first, and then the dearest."""
+        """The indices of the worst episodes: those without success first, and then those with the highest cost."""
         return np.lexsort((-self.costs, -priced(self.costs, self.success, self.task)))[:count].tolist()
 
     def with_optima(self, count: int, workers: int | Workers) -> "FreshResult":

@@ -20,12 +20,13 @@ BEST_MODEL, BEST_STATISTICS = "best_model.zip", "best_model.vecnormalize.pkl"
 
 
 class RegretCallback(BaseCallback):
-    """Measures the model's regret at equal distances, as `EvalCallback` measures returns, and keeps the best model.
+    """Measures the model's regret at regular intervals, as `EvalCallback` measures returns, and saves the best model.
 
-    It evaluates as `ballbot train` does, in the batched closed-form model and in about a second: it reports the 200
-    certified episodes; the best model is that of the least cost on fresh ones. The mean action acts, and observations are
-    normalized as in training, where that has VecNormalize. SB3's logger gets the figures of `training.score_and_validate`,
-    so TensorBoard shows them, and W&B with `wandb.init(sync_tensorboard=True)`.
+    An evaluation is the same as in `ballbot train`, runs in the batched closed-form model, and takes about a second. It
+    reports the regret on the 200 certified episodes. The best model is the one with the lowest mean cost on a fixed set of
+    other episodes. The policy acts without noise, and observations are normalized as in training if that uses VecNormalize.
+    The figures go to the logger of Stable-Baselines3, so TensorBoard shows them, and W&B with
+    `wandb.init(sync_tensorboard=True)`.
     """
 
     def __init__(
@@ -40,12 +41,12 @@ class RegretCallback(BaseCallback):
         """Makes the callback.
 
         Args:
-            task: a name in `TASKS`, or a Task that has a certified set: the one to be judged by, also where training makes it
-                easier.
+            task: a name in `TASKS`, or a Task that has a certified set. The model is measured on this task, even if training
+                uses an easier one.
             eval_freq: control steps of each env between two evaluations. One is made at the end of training as well.
-            save_path: folder of best_model.zip, with best_model.vecnormalize.pkl where the model has statistics, and of
+            save_path: folder of best_model.zip, of best_model.vecnormalize.pkl if the model uses VecNormalize, and of
                 evaluations.csv; None: nothing is written.
-            validation_episodes: how many fresh episodes choose the best model.
+            validation_episodes: number of other episodes on which the best model is chosen.
             robot: a name in `ROBOTS`.
             verbose: 1 prints a line for each evaluation.
 
@@ -66,7 +67,7 @@ class RegretCallback(BaseCallback):
         self._robot = robot
 
     def evaluate(self) -> dict[str, float]:
-        """Measures the present model; returns the figures by name. Raises a PolicyError if it acts in other spaces."""
+        """Measures the present model; returns the figures by name. Raises a PolicyError if its spaces are not the task's."""
         return score_and_validate(self.model, self.task, self._robot, self.validation_episodes)
 
     def _init_callback(self) -> None:

@@ -21,7 +21,7 @@ class RslVecEnv:
 
         Args:
             batch: the envs.
-            seed: of the run; those with other seeds meet other episodes.
+            seed: seed of the run; runs with different seeds have no episodes in common.
         """
         self.batch, self.num_envs, self.device = batch, batch.num_envs, batch.device
         self.max_episode_length = batch.task.steps

@@ -1,4 +1,4 @@
-"""What a policy's files say, readable without torch: which task it was made for, how it was trained, where it is.
+"""The files of policies, read without torch: the task of a policy, how it was trained, and which policies are shipped.
 
 A policy is two files: weights in `NAME.safetensors` and their description in `NAME.json`.
 """
@@ -83,7 +83,7 @@ class PolicySpec:
     observation_digest: str = ""
     """`identity.observation_digest` of its task; "" in files of earlier versions."""
     history: int = 0
-    """How many earlier observations and actions it sees; `history` of its env."""
+    """Number of earlier observations and actions that it observes; `history` of its env."""
     informed: bool = False
     """Whether the robot's parameters (`ROBOT_FACTORS`) are appended to the observation. The policy runs behind a filter that
     estimates them, as in Yu et al., "Preparing for the unknown" (2017)."""
@@ -232,7 +232,7 @@ class PolicyFile:
         return read
 
     def way(self) -> str:
-        """The whole way of its training by its own record: all learners and demonstrators in turn, as "dagger → shac".
+        """All learners and demonstrators of its training in turn, by its own record, for example "dagger → shac".
 
         "" where the record holds no command of `ballbot train`.
         """

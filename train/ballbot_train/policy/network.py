@@ -1,7 +1,7 @@
 """Learned policies: the network, loading and saving it, and the policy as a Controller.
 
 A policy is two files: weights in `NAME.safetensors` and their description in `NAME.json`. Nothing in them is executed.
-This module imports torch; `policy_files` reads descriptions without it.
+This module imports torch; `files` reads descriptions without it.
 """
 
 import functools
@@ -52,7 +52,7 @@ class PolicyNetwork(torch.nn.Module):
     and adds the action that keeps this motion. So it rests exactly at its goal, or orbits exactly on the circle. With routes,
     a network of its own decides on which sides obstacles are passed.
 
-    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in. The
+    With a history, an observation also contains earlier observations and actions; each is transformed to its own frame. The
     observations of an informed policy end with the robot's parameters, and its forces are those of the nominal motors.
     """
 
@@ -183,9 +183,10 @@ class PolicyNetwork(torch.nn.Module):
 class Routes(torch.nn.Module):
     """From observations to the sides on which obstacles are passed, by a small network. Its input is the layout of obstacles.
 
-    A choice of sides is the best of several basins, and a network that averages basins hits what lies between them. So the
-    choice is a separate classification. The layout stays the same throughout an episode, so the choice does not waver.
-    Its outputs, before the greatest is taken, belong to the 2^n choices of obstacles that are passed on the farther side.
+    Each choice of sides has an optimum of its own. A network that averages their actions drives into the obstacle between
+    two paths, so the choice is a separate classification. The layout stays the same throughout an episode, so the choice
+    does not change. The network has an output for each of the 2^n choices of obstacles that are passed on the farther side,
+    and the greatest output is chosen.
     """
 
     def __init__(self, route: Route, hidden: tuple[int, ...], device: str = "cpu"):

@@ -1,4 +1,4 @@
-"""Episodes to look at: the same episode under several controllers, as trajectories with labels. `film` draws them."""
+"""The same episode under several controllers, as trajectories with labels. `film` draws them."""
 
 import itertools
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 @dataclass(frozen=True)
 class Take:
-    """One trajectory to look at.
+    """One trajectory of a replay.
 
     `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `style` is of its lines in figures.
     """
@@ -109,11 +109,11 @@ def certified_replay(
         physics: "bullet", "mujoco" or "rk4".
         skip_planless: leave out controllers that find no plan.
         robot: by name.
-        frictions: coefficients of friction of the floors, for a robot whose ball rolls; default, its own. Controllers
-            expect its own.
+        frictions: coefficients of friction of the floors, for a robot whose ball rolls; default, the robot's own. Controllers
+            always assume the robot's own.
 
     Raises:
-        ValueError: an unknown task, controller or episode, or frictions of a robot whose ball does not roll.
+        ValueError: an unknown task, controller or episode, or frictions for a robot whose ball does not roll.
         PlanError: a controller finds no plan, unless `skip_planless`.
     """
     problem, params = make_task(task, robot), named_robot(robot)

@@ -165,10 +165,11 @@ class _Score(NamedTuple):
 
 
 class Playground:
-    """A ballbot, its ghosts and their world. `step` moves everything by one control step; nothing here waits for real time.
+    """A ballbot and its ghosts. `step` moves all of them by one control step; nothing here waits for real time.
 
-    Controllers are made, and planners plan, within the call that asks for it. A call that raises changes nothing: it names
-    something unknown, a value out of bounds (ValueError), or a controller that cannot be made or finds no plan.
+    A method that needs a new controller or a new plan returns when it is computed. If a method raises an error, it has
+    changed nothing. A ValueError says that a name is unknown or a value is out of bounds; other errors come from a
+    controller that cannot be made or finds no plan.
     """
 
     def __init__(
@@ -192,8 +193,8 @@ class Playground:
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
             episode: see `begin`.
             seed: of random starts, sensor noise and random pushes.
-            robot: name in `robots.ROBOTS`.
-            randomization: name of a track: every episode has a robot of it, which is hidden from the controllers.
+            robot: a name in `ROBOTS`.
+            randomization: name of a track, which draws a robot for every episode, hidden from the controllers.
 
         Raises:
             ValueError: an unknown task, robot, controller, episode or track.
@@ -240,14 +241,14 @@ class Playground:
 
     @property
     def optimum_cost(self) -> float:
-        """The best cost of the certified episode without pushes; NaN of other starts and of a changed robot."""
+        """The optimal cost of the certified episode, without pushes; NaN for other starts and for a changed robot."""
         known, i = self.world.certified, self.episode
         changed = any(self.plant.values()) or self._track.active
         return math.nan if known is None or isinstance(i, str) or changed else float(known.costs[i])
 
     @property
     def shown_push(self) -> np.ndarray | None:
-        """(2,) the push that is drawn, N·s; None if there was none lately."""
+        """(2,) N·s, the push that pictures show; None if there was none in the last moments."""
         return self._push if self.elapsed < self._push_until else None
 
     @property
@@ -256,7 +257,7 @@ class Playground:
         return [labels.color(Path(runner.name).stem, i) for i, runner in enumerate(self.runners)]
 
     def drawing(self) -> Drawing:
-        """The present moment."""
+        """The present state of all robots, as the content of a picture."""
         main, robots, paths, colors = self.main, [], [], self.colors
         for i, runner in reversed(list(enumerate(self.runners))):
             alpha = GHOST_OPACITY if i else 1.0

@@ -44,10 +44,10 @@ class WorkerError(RuntimeError):
 
 @dataclass(frozen=True)
 class Workers:
-    """Where the items of a run are done. The results are the same everywhere."""
+    """Where the work of a command is done. The results are the same everywhere."""
 
     workers: int | None = None
-    """Processes, or tasks on a Ray cluster; default, all cores."""
+    """Number of processes, or of jobs at the same time on a Ray cluster; default, one for every core."""
     ray: str | None = None
     """Address of a Ray cluster, HOST:PORT, "auto" or "local"."""
 

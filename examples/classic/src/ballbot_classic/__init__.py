@@ -1,4 +1,4 @@
-"""Systems that everybody has, as robots and tasks of ballbot-gym: their optima, and the regret of any policy.
+"""Well-known systems as robots and tasks of ballbot-gym: their optima, and the regret of any policy.
 
 Installed, the package is found by `import ballbot_gym`. From a checkout, `ballbot_classic.register()` does the same.
 """

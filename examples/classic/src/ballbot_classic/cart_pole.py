@@ -2,7 +2,7 @@
 
 Importing this file registers both. Then all commands for ballbots work here too:
 
-    ballbot benchmark --task ballbot_classic.cart_pole:cart_pole --controllers trajopt nmpc
+    ballbot benchmark --tasks ballbot_classic.cart_pole:cart_pole --controllers trajopt nmpc
 """
 
 import math

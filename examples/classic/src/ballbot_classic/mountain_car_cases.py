@@ -1,7 +1,7 @@
 """The optimum of MountainCarContinuous-v0 by cases, in each of which the problem is smooth.
 
-A case says how many control steps the car takes, and whether the wall stops it. Where it does, the motion has two parts that
-know nothing of each other: to the wall, and from rest at the wall to the goal. All parts are one problem of the longest
+A case says how many control steps the car takes, and whether the wall stops it. Where it does, the motion has two
+independent parts: to the wall, and from rest at the wall to the goal. All parts are one problem of the longest
 episode, whose first steps stand still where fewer are taken.
 """
 

@@ -1,4 +1,4 @@
-"""Optima replayed in the environments of Gymnasium that their tasks are the very problems of."""
+"""Replays optima in the environments of Gymnasium that pose the same problem as their tasks."""
 
 from typing import Any
 
