@@ -103,6 +103,17 @@ def test_every_way_to_give_a_policy_gives_the_same_result(turns):
         np.testing.assert_allclose(again.costs, turns.costs[:20], rtol=1e-3)
 
 
+def test_a_function_of_one_observation_acts_as_one_of_all_of_them():
+    gain = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1.3]], np.float32)
+    of_all = evaluate_fresh(lambda seen: (seen @ torch.as_tensor(gain.T)).clip(-1, 1), "stabilize", 5)
+    of_one = evaluate_fresh(lambda seen: np.clip(gain @ seen, -1, 1), "stabilize", 5)
+    np.testing.assert_allclose(of_one.costs, of_all.costs, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"gives \(5, 3\).*give actions \(5, 2\) for all of them, or \(2,\) for one"):
+        evaluate_fresh(lambda seen: seen[..., :3], "stabilize", 5)
+    with pytest.raises(ZeroDivisionError):
+        evaluate_fresh(lambda seen: 1 / 0, "stabilize", 5)
+
+
 def test_bins_hold_every_episode_once(turns):
     bins = turns.bins()
     assert len(bins) == 4

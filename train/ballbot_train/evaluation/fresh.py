@@ -269,7 +269,8 @@ def run_policy(
 
     Args:
         policy: a policy file, a saved model, the name of a shipped policy, perhaps followed by that of a filter, a model with
-            Stable-Baselines3's `predict`, or a function of tensors such as a `PolicyNetwork`. It gets float32.
+            Stable-Baselines3's `predict`, or a function of tensors such as a `PolicyNetwork`. It gets float32. A function of
+            one observation works as well, and is slower.
         task: the task.
         x: (B, 8) initial states.
         c: (B, nc) constants.
@@ -318,7 +319,31 @@ def _act(policy: Any, batch: BallbotBatch) -> Callable[[torch.Tensor], torch.Ten
     if isinstance(policy, PolicyNetwork) and policy.spec.informed:
         return lambda seen: policy.knowing(seen.float(), cast(BatchState, batch.state), batch.randomization)
     function: Any = policy
-    return lambda seen: function(seen.float())
+    return lambda seen: _asked(function, seen.float(), batch.params.action_size)
+
+
+def _asked(function: Any, seen: torch.Tensor, actions: int) -> torch.Tensor:
+    """Actions (B, actions) of a function of tensors (B, no), or of one that takes a single observation (no,) as on certified
+    episodes; that one is called for each row.
+    """
+    shape = (len(seen), actions)
+    try:
+        given = function(seen)
+        if isinstance(given, torch.Tensor) and given.shape == shape:
+            return given
+        reason: Exception | None = None
+    except (TypeError, ValueError, RuntimeError, IndexError) as error:
+        given, reason = None, error
+    try:
+        single = np.stack([np.asarray(function(row), np.float32).reshape(-1) for row in seen.cpu().numpy()])
+    except (TypeError, ValueError, RuntimeError, IndexError) as error:
+        raise reason or error from None
+    if single.shape != shape:
+        raise reason or ValueError(
+            f"the policy gives {tuple(getattr(given, 'shape', ()))} for observations {tuple(seen.shape)}; give actions "
+            f"{shape} for all of them, or ({actions},) for one observation"
+        )
+    return torch.as_tensor(single, device=seen.device)
 
 
 def _behind_filter(controller: Controller, batch: BallbotBatch) -> Callable[[torch.Tensor], torch.Tensor]:
