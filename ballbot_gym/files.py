@@ -41,7 +41,7 @@ def read(path: str | Path, limit: int = READ_LIMIT) -> bytes:
         if not os.path.exists(path):
             raise FileError(f"{path}: no such file")
         if not os.path.isfile(path):  # reading a pipe or a device may never end
-            raise FileError(f"{path} is no regular file")
+            raise FileError(f"{path} is not a regular file")
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
             content = b"" if size > limit else _read_at_most(file, limit + 1)
@@ -77,7 +77,7 @@ def read_json(path: str | Path, limit: int = JSON_LIMIT, content: bytes | None =
     except RecursionError:
         raise FileError(f"{path} holds no JSON that can be read: it is nested too deeply") from None
     except ValueError as error:
-        raise FileError(f"{path} holds no JSON: {error}") from error
+        raise FileError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(held, kind):
         raise FileError(f"{path} holds no {'object' if kind is dict else kind.__name__} of JSON")
     return held
@@ -100,7 +100,7 @@ def read_npz(path: str | Path, limit: int = READ_LIMIT, content: bytes | None = 
     try:
         return {name.removesuffix(".npy"): read_array(io.BytesIO(array)) for name, array in members.items()}
     except Exception as error:  # NumPy's headers have dozens of ways to fail, and all mean the same
-        raise FileError(f"{path} is no .npz file, or a damaged one: {error}") from error
+        raise FileError(f"{path} is not a valid .npz file: {error}") from error
 
 
 def unzipped(content: bytes, path: str | Path, limit: int = READ_LIMIT, kind: str = "zip archive") -> dict[str, bytes]:
@@ -139,7 +139,7 @@ def unzipped(content: bytes, path: str | Path, limit: int = READ_LIMIT, kind: st
     except FileError:
         raise
     except Exception as error:  # zipfile has dozens of ways to fail, and all mean the same
-        raise FileError(f"{path} is no {kind}, or a damaged one: {error}") from error
+        raise FileError(f"{path} is not a valid {kind}: {error}") from error
 
 
 def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None, most: float = math.inf) -> np.ndarray:
@@ -168,7 +168,7 @@ def write(path: str | Path, content: bytes | str) -> Path:
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise FileError(f"{path} is no regular file, and is not replaced by one; give another path")
+        raise FileError(f"{path} is not a regular file, so it is not replaced; give another path")
     path.parent.mkdir(parents=True, exist_ok=True)
     # The name cannot be guessed, and the file must be new. Otherwise another user's link could lead to another file.
     unfinished = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")

@@ -177,8 +177,8 @@ def _check_class(kind: Any) -> None:
     unknown = [name for name in own if name not in known and "ClassVar" not in str(own[name])]
     if unknown:
         raise TypeError(
-            f"{kind.__name__}.{unknown[0]} is no field: decorate {kind.__name__} with @dataclass(frozen=True), or annotate "
-            "it as a ClassVar"
+            f"{kind.__name__}.{unknown[0]} is not a field: decorate {kind.__name__} with @dataclass(frozen=True), or "
+            "annotate it as a ClassVar"
         )
     for field in fields(kind):
         if field.default is MISSING and field.default_factory is MISSING:

@@ -309,7 +309,7 @@ def check_observation(observation: Any, params: Robot, randomization: Randomizat
     if observation == "sensors" and not params.SENSORS:
         raise ValueError("only robots with wheels have sensors; give robot='omni' or observation='state'")
     if observation == "sensors" and randomization.is_noisy:
-        raise ValueError("sensors have noise of their own; leave out that of the randomization")
+        raise ValueError("sensor readings have noise of their own; leave out the noise of the randomization")
     return observation
 
 

@@ -92,7 +92,7 @@ class Trajectory(Moving):
         if n < 0 or self.t.shape != (n + 1,) or self.x.ndim != 2 or len(self.x) != n + 1 or not self.x.shape[1]:
             raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, n)")
         if self.u.ndim != 2 or len(self.u) not in (n, n + 1) or not self.u.shape[1]:
-            raise TrajectoryError(f"u {self.u.shape} must be ({n}, m), held, or ({n + 1}, m), linear")
+            raise TrajectoryError(f"u {self.u.shape} must be ({n}, m) for held forces, or ({n + 1}, m) for linear ones")
         if self.xdot is not None and self.xdot.shape != self.x.shape:
             raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
         if not (np.diff(self.t) > 0).all():

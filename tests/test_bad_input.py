@@ -159,7 +159,7 @@ ROBOTS = [
     (params(body_mass=math.nan), "body_mass must be positive and finite, not nan"),
     (params(inertia="1"), "inertia must be a number, not '1'"),
     (lambda f: read_urdf(f / "none.urdf"), "none.urdf: no such file"),
-    (lambda f: read_urdf(f), "is no regular file; give the path of a URDF"),
+    (lambda f: read_urdf(f), "is not a regular file; give the path of a URDF"),
     (lambda f: read_urdf("a\0b"), "give the path of a URDF"),
 ]
 
@@ -261,10 +261,10 @@ def trajectory(**changes):
 
 TRAJECTORIES = [
     (lambda f: Trajectory.load(f / "none.npz"), "none.npz: no such file"),
-    (lambda f: Trajectory.load(f), "is no regular file"),
-    (lambda f: Trajectory.load("/dev/zero"), "is no regular file"),
-    (written(b"", Trajectory.load), "is no .npz file, or a damaged one"),
-    (written(b"garbage" * 99, Trajectory.load), "is no .npz file, or a damaged one"),
+    (lambda f: Trajectory.load(f), "is not a regular file"),
+    (lambda f: Trajectory.load("/dev/zero"), "is not a regular file"),
+    (written(b"", Trajectory.load), "is not a valid .npz file"),
+    (written(b"garbage" * 99, Trajectory.load), "is not a valid .npz file"),
     (written(npz(t=np.arange(3.0)), Trajectory.load), "it has no array x, u"),
     (written(archive({"t.npy": npy(HUGE)}), Trajectory.load), "a damaged one"),
     (written(archive({"t.npy": npy(HUGE.replace("<f8", "|O"))}), Trajectory.load), "Object arrays cannot be loaded"),
@@ -335,9 +335,9 @@ def header(document, data=b""):
 
 POLICIES = [
     (lambda f: load_policy(f / "none.json"), "none.json is not a policy"),
-    (policy(text="{"), "holds no JSON"),
+    (policy(text="{"), "is not valid JSON"),
     (policy(text="[" * 100_000), "it is nested too deeply"),
-    (policy(text='{"spec": 3}'), "its spec is no object"),
+    (policy(text='{"spec": 3}'), "its spec is not an object"),
     (policy(squash="sigmoid"), "squash must be one of tanh, clip, tanh_in_frame, not 'sigmoid'"),
     (policy(activation="exec"), "activation must be one of tanh, relu, silu, not 'exec'"),
     (policy(linear="false"), "linear must be true or false, not 'false'"),
@@ -380,7 +380,7 @@ def entry(**changes):
 RESULTS = [
     (lambda f: read_results(f), "leaderboard.json: no such file"),
     (lambda f: read_results(f / "none.json"), "holds no episodes of a benchmark"),
-    (results(lambda text: text[:-9]), "holds no JSON"),
+    (results(lambda text: text[:-9]), "is not valid JSON"),
     (results(lambda text: "[" * 100_000), "nested too deeply"),
     (results(lambda text: '{"about": {}}'), "holds no episodes of a benchmark"),
     (entry(cost=None), "has the cost nan"),
@@ -404,7 +404,7 @@ def dataset(metadata=None):
 DESCRIBED = {"demos": {}, "task": repr(make_task("stabilize")), "observation_version": 1}
 
 DEMOS = [
-    (dataset(), 'is no dataset of "ballbot demos"'),
+    (dataset(), 'is not a dataset of "ballbot demos"'),
     (dataset("[" * 100_000), "nested too deeply"),
     (dataset('{"demos": 3}'), "not made by ballbot demos"),
     (dataset(json.dumps(DESCRIBED)), 'is damaged; record it again with "ballbot demos"'),
@@ -504,7 +504,7 @@ EVALUATION = [
     (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, not 0"),
     (lambda f: evaluate(nothing, episodes=[0]), "episodes must be a number of episodes, not"),
     (lambda f: training.score_and_validate(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
-    (lambda f: evaluate(None), "None is no policy: give a Controller"),
+    (lambda f: evaluate(None), "None is not a policy: give a Controller"),
     (lambda f: evaluate("pid"), "unknown controller 'pid'"),
     (lambda f: evaluate("mine.zip"), "mine.zip: no such file"),
     (lambda f: controllers_of([]), "give at least one task"),

@@ -118,7 +118,7 @@ def test_what_cannot_be_compared_is_an_error_that_says_why(regrets):
     a = results(regrets)
     with pytest.raises(ValueError, match="A has lqr on stabilize, nmpc on stabilize, B has trajopt on stabilize"):
         only(a + results(regrets, "nmpc"), results(regrets, "trajopt"))
-    with pytest.raises(ValueError, match="episode 0 of lqr on stabilize is there twice"):
+    with pytest.raises(ValueError, match="episode 0 of lqr on stabilize occurs twice"):
         only(a + a[:1], a)
     for margin in (-0.1, math.nan, math.inf):
         with pytest.raises(ValueError, match=r"^training_margin must be a number from 0"):

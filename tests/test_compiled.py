@@ -176,7 +176,7 @@ def test_compiler_that_hangs_is_given_up_and_not_asked_again(fake_compiler, monk
     program = fake_compiler(b"#!/bin/sh\n" + answer + b"exec sleep 30\n")
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
-    assert f"{program} did not answer within 0.2 s" in caplog.text
+    assert f"{program} did not finish within 0.2 s" in caplog.text
     monkeypatch.setattr(libraries, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
     assert compiled.compiled("others", functions) is functions
     assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) == 1

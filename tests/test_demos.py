@@ -106,7 +106,7 @@ def test_a_dataset_of_another_task_is_refused(dataset, tmp_path):
         load_demos(dataset, make_task("turn"))
     with pytest.raises(ValueError, match="not of Stabilize"):
         load_demos(dataset, make_task("stabilize", duration=4.0))
-    with pytest.raises(ValueError, match="no dataset"):
+    with pytest.raises(ValueError, match="not a dataset"):
         load_demos(tmp_path, make_task("stabilize"))
 
 

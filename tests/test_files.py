@@ -17,7 +17,7 @@ def test_no_device_pipe_or_folder_is_replaced_by_a_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     for path in ("/dev/null", tmp_path / "pipe", tmp_path / "folder"):
-        with pytest.raises(files.FileError, match="is no regular file"):
+        with pytest.raises(files.FileError, match="is not a regular file"):
             files.write(path, "text")
     assert Path("/dev/null").is_char_device()
     assert (tmp_path / "pipe").is_fifo()

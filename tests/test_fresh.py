@@ -165,7 +165,7 @@ def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path
 
 
 def test_what_does_not_act_is_refused():
-    with pytest.raises(TypeError, match="is no policy"):
+    with pytest.raises(TypeError, match="is not a policy"):
         evaluate_fresh(3, "turn", 1)
     with pytest.raises(ValueError, match="trajopt is an expert"):
         evaluate_fresh("trajopt", "turn", 1)

@@ -200,5 +200,7 @@ def test_a_runs_folder_is_its_policy_and_a_checkpoint_of_others_is_named(tmp_pat
     save_policy(run / "policy", PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))), {})
     rows = [evaluate(path, "stabilize", 1, "rk4").cost_mean for path in (str(run), run / "policy.json")]
     assert rows[0] == rows[1]
-    with pytest.raises(PolicyError, match=r"model_100\.pt is no policy's \.json, nor a model of Stable-Baselines3"):
+    with pytest.raises(
+        PolicyError, match=r"model_100\.pt is neither a policy's \.json nor a model of Stable-Baselines3"
+    ):
         evaluate("model_100.pt", "stabilize", 1, "rk4")

@@ -148,7 +148,7 @@ def test_a_warm_start_is_one_and_not_backwards(demos, name):
     with pytest.raises(ValueError, match="give one of --demos and --start"):
         LEARNERS[name].make(make_task("stabilize"), default_params(), TINY[name], 0, demos, given)
     other, message = {
-        "ppo": ({"backwards": True}, "backwards goes from scratch alone"),
+        "ppo": ({"backwards": True}, "--backwards works only from scratch"),
         "sac": ({"n_steps": 3}, "n_steps must be 1 with demonstrations"),
     }[name]
     with pytest.raises(ValueError, match=message):

@@ -156,6 +156,7 @@ class LaneChange(Stabilize):
 
 def test_lqr_about_a_single_point_that_moves_is_refused_with_what_a_reference_is(params):
     with pytest.raises(
-        PlanError, match=r"one point must rest\. Let LaneChange\.reference return a motion, with one point per"
+        PlanError,
+        match=r"LQR can only hold a robot at rest\. Let LaneChange\.reference return a motion, with one point per",
     ):
         LqrController(LaneChange(), params).reset(0.0, np.zeros(8), np.zeros(0))

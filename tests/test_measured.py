@@ -79,9 +79,11 @@ def test_arguments_that_do_not_fit_say_what_is_missing():
     short = Trajectory(motion.t[:50], motion.x[:50], motion.u[:49])
     with pytest.raises(ValueError, match=r"constants .'radius', 'speed'.*give constants, . numbers, not 0"):
         regret(motion, "orbit")
-    with pytest.raises(ValueError, match=r"lasts 0.98 s, and the episode of BallbotOrbit-v0 8 s: what the rest costs"):
+    with pytest.raises(
+        ValueError, match=r"lasts 0.98 s, and an episode of BallbotOrbit-v0 lasts 8 s, so the cost of the rest"
+    ):
         regret(short, "orbit", "paper", c)
-    with pytest.raises(ValueError, match=r"lasts 7\.992 s, and the episode of BallbotOrbit-v0 8 s"):
+    with pytest.raises(ValueError, match=r"lasts 7\.992 s, and an episode of BallbotOrbit-v0 lasts 8 s"):
         regret((0.999 * motion.t, motion.x, motion.u), "orbit", "paper", c)
     with pytest.raises(ValueError, match="at least two times"):
         regret(Trajectory(np.zeros(1), np.zeros((1, 8)), np.zeros((0, 2))), "stabilize")

@@ -130,7 +130,7 @@ WRONG = {
             type("Mine", (Stabilize,), {"id": "Mine-v0", "__annotations__": {"speed": float}, "speed": 1.0})
         ),
         TypeError,
-        r"Mine.speed is no field: decorate Mine with @dataclass\(frozen=True\)",
+        r"Mine.speed is not a field: decorate Mine with @dataclass\(frozen=True\)",
     ),
     "a taken robot": (lambda: register_robot("rolling", URDF_PATH), ValueError, "'rolling' is taken by another robot"),
     "fields": (lambda: register_robot("mine", URDF_PATH, {"turn": 3}), TypeError, "fields must be fields by task"),

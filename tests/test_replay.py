@@ -59,7 +59,7 @@ def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects():
 
 
 def test_a_ball_that_does_not_roll_has_no_floors():
-    with pytest.raises(ValueError, match="'paper': no friction of a floor acts on a PointBall"):
+    with pytest.raises(ValueError, match="'paper': the friction of the floor has no effect on a PointBall"):
         certified_replay("stabilize", ["lqr"], 0, physics="rk4", frictions=[0.8])
 
 

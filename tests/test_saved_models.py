@@ -131,7 +131,7 @@ def test_a_model_of_other_spaces_is_not_scored_without_what_made_them(name, tmp_
             evaluated(model, "stabilize", 1)
         with pytest.raises(PolicyError, match=re.escape(said)):
             evaluated(tmp_path / "model.zip", "stabilize", 1)
-    with pytest.raises(ValueError, match=r"Where a wrapper changed|which is none of stabilize|no network of linear"):
+    with pytest.raises(ValueError, match=r"Where a wrapper changed|which is none of stabilize|not a network of linear"):
         controllers_of(["stabilize"], [str(tmp_path / "model.zip")])
 
 
@@ -199,16 +199,16 @@ def with_weights(**changes):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (bombed, "is no saved model that can be read"),
+        (bombed, "cannot be read as a saved model"),
         (with_weights(weight=lambda weight: weight * float("nan")), "action_net.weight holds NaN or infinity"),
         (with_weights(weight=lambda weight: weight + 1j), "action_net.weight holds torch.complex64"),
         (with_weights(weight=lambda weight: weight.int()), "action_net.weight holds torch.int32"),
         (with_weights(weight=lambda weight: weight + 3e38), "holds numbers beyond ±1e"),
         (with_weights(weight=lambda weight: torch.ones(1).expand(2, 2**28)), "numbers, and stores fewer"),
-        (with_weights(bias=lambda bias: torch.zeros(3)), "is no network of linear layers that ends in actions"),
+        (with_weights(bias=lambda bias: torch.zeros(3)), "is not a network of linear layers that ends in actions"),
         (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}, which is not read"),
         (lambda members: members.pop("data"), "it holds no data"),
-        (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
+        (lambda members: members.update(data=b"{}"), "cannot be read as a saved model"),
         (with_data(policy_kwargs={"squash_output": True}), "squashed by tanh"),
         (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
         (with_data(policy_kwargs={"features_extractor_class": "x"}), "a network that extracts features"),

@@ -168,7 +168,7 @@ def test_certified_shards_are_the_certified_set(tmp_path):
 )
 def test_addresses_that_are_no_storage_are_refused(url):
     with pytest.raises(
-        files.FileError, match=r"cannot be read: .*is no storage; give a folder, or a URL that begins with"
+        files.FileError, match=r"cannot be read: .*is not a supported storage; give a folder, or a URL that begins with"
     ):
         shards.Shards(url)
 

@@ -91,7 +91,7 @@ def test_inertias_that_no_body_can_have_are_refused(params):
 
 def test_bullet_refuses_a_robot_whose_numbers_it_does_not_hold(params, monkeypatch):
     monkeypatch.setattr(bullet, "urdf_text", lambda robot: urdf_text(robot).replace('"15.0"', '"fifteen"'))
-    with pytest.raises(RuntimeError, match=r"PyBullet took \(0.0"):
+    with pytest.raises(RuntimeError, match=r"PyBullet has \(0.0"):
         make_simulator("bullet", params, 0.02)
 
 
@@ -106,7 +106,7 @@ def test_a_robot_that_is_replaced_moves_as_one_made_anew(name, change, physics):
         simulator.reset(GENTLE)
         ends.append([simulator.step((5.0, -3.0)) for _ in range(5)])
     assert ends[0] == ends[1]
-    with pytest.raises(ValueError, match="this simulator is of a"):
+    with pytest.raises(ValueError, match="this simulator was made for a"):
         simulators[0].set_params(named_robot("rolling" if name == "paper" else "paper"))
     for simulator in simulators:
         simulator.close()

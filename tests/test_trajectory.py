@@ -85,7 +85,10 @@ BAD_ARRAYS = {
     "matrix of times": ({"t": np.zeros((2, 1))}, r"t \(2, 1\)"),
     "scalar time": ({"t": 0.0}, "t"),
     "no times": ({"t": [], "x": np.zeros((0, 8)), "u": np.zeros((0, 2))}, "t"),
-    "too many forces": ({"u": np.zeros((3, 2))}, r"u \(3, 2\) must be \(1, m\), held, or \(2, m\), linear"),
+    "too many forces": (
+        {"u": np.zeros((3, 2))},
+        r"u \(3, 2\) must be \(1, m\) for held forces, or \(2, m\) for linear ones",
+    ),
     "slopes of another shape": ({"xdot": np.zeros((1, 8))}, r"xdot \(1, 8\)"),
     "infinite": ({"x": np.full((2, 8), np.inf)}, "finite"),
     "NaN force": ({"u": [[np.nan, 0.0]]}, "finite"),

@@ -157,13 +157,13 @@ def load(
         raise CertificateError("no optimum is known where the actuator lags; leave actuator_lag out")
     try:
         if path is None and name_of(task) is None:  # a subclass may have its parent's id and name
-            raise CertificateError(f"no evaluation set of {type(task).__name__}, which is none of TASKS")
+            raise CertificateError(f"there is no evaluation set of {type(task).__name__}, which is not in TASKS")
         track = track_of(randomization)
         if path is None and randomization.moves_optima and not track:
-            raise CertificateError(f"no evaluation set of {randomization}, which is none of TRACKS")
+            raise CertificateError(f"there is no evaluation set of {randomization}, which is not in TRACKS")
         given = path_of(task, name, track) if path is None else Path(path)
         if not given.exists():
-            raise CertificateError(f"{given}: no evaluation set of {task.id}")
+            raise CertificateError(f"there is no evaluation set of {task.id} at {given}")
         found = _read((_version(given),), task, params, randomization)
         if path is None and not all(0 <= index < len(found) for index in needed):
             raise CertificateError(f"{given} has {len(found)} episodes, and not all of {shown(needed)}")
@@ -232,8 +232,8 @@ def _read(
     trajectories = tuple(Trajectory(*each) for each in zip(times, states, forces, strict=True))
     if not _holds(arrays, task, params, randomization):
         raise CertificateError(
-            f"{versions[0][0]}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were "
-            "computed, because cost, limits or equations have changed since"
+            f"{versions[0][0]}: its optimal trajectories have other states or costs in {task.problem()} than when they were "
+            "computed, because the cost, the limits or the equations have changed since then"
         )
     return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
 
@@ -258,7 +258,7 @@ def _arrays_of(path: Path, task: Task, params: Robot, randomization: Randomizati
     except CertificateError:
         raise
     except ValueError as error:
-        raise CertificateError(f"{path} is no evaluation set: {error}") from error
+        raise CertificateError(f"{path} is not an evaluation set: {error}") from error
 
 
 def _command(task: Task, params: Robot, robot: str, file: bool, track: str) -> str:

@@ -45,7 +45,9 @@ def look(params: Robot) -> dict[str, Any]:
         ValueError: it is no ballbot.
     """
     if not isinstance(params, Ballbot):
-        raise ValueError(f'the page draws ballbots, not a {type(params).__name__}; take render_mode="rgb_array"')
+        raise ValueError(
+            f'the page draws only ballbots, and not a {type(params).__name__}; use render_mode="rgb_array"'
+        )
     measures = {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")}
     return {
         "robot": measures | {"wheel_radius": params.wheel_radius},

@@ -133,7 +133,7 @@ class _BulletSimulator(Simulator):
             mass, _, inertia, place, *_ = self._bullet.getDynamicsInfo(self._robot, link, physicsClientId=self._client)
             found = (mass, *inertia, *place)[: len(numbers)]
             if any(not math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12) for a, b in zip(found, numbers, strict=True)):
-                raise RuntimeError(f"PyBullet took {found} for {numbers}, kg, kg·m² and m; it cannot simulate {robot}")
+                raise RuntimeError(f"PyBullet has {found} for {numbers}, kg, kg·m² and m; it cannot simulate {robot}")
 
 
 class _BulletContactSimulator(_BulletSimulator):
@@ -221,7 +221,7 @@ class _BulletContactSimulator(_BulletSimulator):
         self._bullet.changeDynamics(body, link, lateralFriction=friction, **none)
         found = self._bullet.getDynamicsInfo(body, link, physicsClientId=self._client)[1]
         if not math.isclose(found, friction, rel_tol=1e-6):
-            raise RuntimeError(f"PyBullet took {found} for a friction of {friction}")
+            raise RuntimeError(f"PyBullet has a friction of {found}, and it should have {friction}")
 
 
 class _BulletOmniSimulator(_BulletContactSimulator):

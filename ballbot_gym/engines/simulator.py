@@ -69,6 +69,6 @@ class Simulator(Protocol):
         """Raises a ValueError if a robot is of another kind than a simulator's own."""
         if type(params) is not type(own):
             raise ValueError(
-                f"this simulator is of a {type(own).__name__}, not of a {type(params).__name__}; make another with "
-                "make_simulator()"
+                f"this simulator was made for a {type(own).__name__}, and the robot is a {type(params).__name__}; make "
+                "another with make_simulator()"
             )

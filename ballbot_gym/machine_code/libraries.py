@@ -71,7 +71,7 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
     except subprocess.TimeoutExpired as error:
         _hanging.add(program)
         raise NoMachineCodeError(
-            f"{program} did not answer within {error.timeout:g} s, and is not asked again"
+            f"{program} did not finish within {error.timeout:g} s, so it is not run again"
         ) from error
     except (OSError, RuntimeError) as error:
         # a program that cannot be run, no home, or a folder that cannot be written

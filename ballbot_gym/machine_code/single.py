@@ -242,9 +242,7 @@ def _check(problem: StepProblem, function: Callable[..., None], robot: Robot) ->
         numbers = np.array([0.0] * count + [part for name in sizes for part in given[name]])
         function(ctypes.c_void_p(numbers.ctypes.data))
         if not np.allclose(numbers[:count], expected, rtol=1e-6, atol=1e-9, equal_nan=True):
-            raise NoMachineCodeError(
-                f"{problem.task.id} computes something else with CasADi's symbols than with numbers"
-            )
+            raise NoMachineCodeError(f"{problem.task.id} gives other results with CasADi's symbols than with numbers")
 
 
 def _value(robot: Any, name: str) -> float:

@@ -180,7 +180,9 @@ class Robot(ABC):
         Raises:
             ValueError: no friction acts on this kind of robot.
         """
-        raise ValueError(f"no friction of a floor acts on a {type(self).__name__}; give a robot whose ball rolls")
+        raise ValueError(
+            f"the friction of the floor has no effect on a {type(self).__name__}; give a robot whose ball rolls"
+        )
 
     def pushed(self, x: Vector, impulse: Vector) -> Vector:
         """The state just after a horizontal impulse (..., 2), N·s.

@@ -188,8 +188,8 @@ class _Urdf:
             mass = link.find("inertial/mass")
             if ("link", name) not in known and mass is not None and _parts(mass.get("value", "")) != (0.0,):
                 raise self.error(
-                    f"link '{name}' has a mass, but the equations of motion have ball and body alone; add its mass, and what "
-                    "it does to the centre of mass and the inertias, to link 'body'"
+                    f"link '{name}' has a mass, but the equations of motion contain only ball and body; add its mass, and "
+                    "its effect on the centre of mass and the inertias, to link 'body'"
                 )
         free = {("roll", "axis"), ("x", "origin")} | (set() if rolls else {("ball", "inertial/inertia")})
         for each in wanted:

@@ -84,7 +84,9 @@ def _check_cost(task: Task, params: Robot, x: np.ndarray, begin: np.ndarray, whe
             f"{kind}.cost gives {cost:g} without force and {more:g} with one {where}; make it finite and ≥ 0"
         )
     if more != again:
-        raise ValueError(f"{kind}.cost gives {more:g} and {again:g} for the same x, u and c; draw nothing in it")
+        raise ValueError(
+            f"{kind}.cost gives {more:g} and {again:g} for the same x, u and c; use no random numbers in it"
+        )
     states = [x + 0.1, x - 0.1, *(x + np.random.default_rng(0).uniform(-0.3, 0.3, (4, len(x))))]
     if cost == more == 0 and not any(_number(task.cost(state, force, begin)) for state in states):
         raise ValueError(f"{kind}.cost gives 0 for every state and force, so that no motion is better than another")

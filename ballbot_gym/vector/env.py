@@ -348,7 +348,7 @@ def _without_torch(
         and check_observation(observation, params, varied) == "state"
     )
     if engine == "torch" or device != "cpu" or compile != "auto" or (engine == "auto" and not plain):
-        raise missing('engine="torch", another device, compile, or what varies or is remembered', "torch", "train")
+        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
     if dtype not in ("float32", "float64"):
         raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
     real = np.float32 if dtype == "float32" else np.float64

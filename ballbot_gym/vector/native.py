@@ -285,7 +285,7 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
     found, expected = outcomes
     for name in expected:
         if not np.allclose(found.get(name, np.nan), expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
-            raise NoMachineCodeError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
+            raise NoMachineCodeError(f"{name} of {task.id} gives other results with CasADi's symbols than with numbers")
 
 
 def _source(task: Task, params: Robot, double: bool) -> str:

@@ -41,6 +41,6 @@ def _check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:
     bad = [i for i, is_bad in enumerate((mask & (violated >= 0)).tolist()) if is_bad]
     if bad:
         raise ValueError(
-            f"start states of envs {bad[:8]} violate limits of {task.id}: that of env {bad[0]} the limit of "
-            f"{task.limit_names[int(violated[bad[0]])]}"
+            f"start states of envs {bad[:8]} violate limits of {task.id}: the start state of env {bad[0]} violates the limit "
+            f"of {task.limit_names[int(violated[bad[0]])]}"
         )

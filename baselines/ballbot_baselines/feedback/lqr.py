@@ -63,7 +63,7 @@ class LqrController:
         states, forces = params.extended(found.x, found.u)
         if len(states) == 1 and not is_equilibrium(params, states[0], forces[0]):
             raise PlanError(
-                f"LQR of {task.id} would hold the robot at one point that it leaves by itself: a reference of one point must "
+                f"the reference of {task.id} is one point, at which the robot does not rest; LQR can only hold a robot at "
                 f"rest. Let {type(task).__name__}.reference return a motion, with one point per control step"
             )
         reference = replace(found, x=states, u=forces)

@@ -140,7 +140,7 @@ def optimum_of(
         states.append(np.array(params.step(states[-1], none, dt, substeps_for(dt))))
         violated = task.violated(states[-1], task.at(c, (k + 1) * dt))
         if violated or min(params.limits(states[-2], none, hold=dt), default=1.0) < 0:
-            raise PlanError(f"{task.id}: the limit of {violated or 'grip'} is violated before a force can come")
+            raise PlanError(f"{task.id}: the limit of {violated or 'grip'} is violated before the first force can act")
     rest, start = replace(task, duration=dt * (task.steps - delay)), delay * dt
     paths = None
     if rest.steps % COARSE and task.passed_obstacles(c) is not None:

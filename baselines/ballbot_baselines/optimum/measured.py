@@ -112,9 +112,9 @@ def _end(task: Task, params: Robot, moved: Trajectory, x: np.ndarray, c: np.ndar
     ended = np.flatnonzero(np.broadcast_to(did.terminated + did.truncated, steps.shape))
     if not len(ended):
         raise ValueError(
-            f"the trajectory lasts {moved.duration:g} s, and the episode of {task.id} {task.duration:g} s"
-            f"{' unless it reaches its goal' if task.first_exit else ''}: what the rest costs is not known; record all of "
-            f"it, or give a task of that duration, such as {type(task).__name__}(duration=...)"
+            f"the trajectory lasts {moved.duration:g} s, and an episode of {task.id} lasts {task.duration:g} s"
+            f"{' unless it reaches its goal' if task.first_exit else ''}, so the cost of the rest is not known; record the "
+            f"whole episode, or give a task of that duration, such as {type(task).__name__}(duration=...)"
         )
     end = int(ended[0])
     violated = int(did.violated[end])

@@ -153,8 +153,8 @@ class _Ilqr:
             )
         if not params.BATCHED_OPTIMA:
             raise NotImplementedError(
-                f"many optima at once do not support {type(params).__name__}, see Robot.BATCHED_OPTIMA; find_optimum solves "
-                "them one by one"
+                f"the search of many optima at once does not support {type(params).__name__}, see Robot.BATCHED_OPTIMA; "
+                "find_optimum solves its episodes one by one"
             )
         kind = kind_of(task, params)  # which refuses formulas that cannot be optimized
         self._limit, self.rest = params.force_limit, None if free_time else _rest(task, params)

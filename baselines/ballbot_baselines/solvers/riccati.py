@@ -41,8 +41,8 @@ def discrete_lqr(
         p = scipy.linalg.solve_discrete_are(a, b, q, r)
     except np.linalg.LinAlgError:
         raise PlanError(
-            f"LQR of {task.id} has no gain where its reference rests: {type(task).__name__}.cost must grow there with the "
-            "square of the error of the state and of the force"
+            f"LQR of {task.id} has no gain at its reference: {type(task).__name__}.cost must grow there with the square of "
+            "errors of the state and of the force"
         ) from None
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 

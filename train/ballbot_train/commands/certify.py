@@ -52,7 +52,9 @@ def certify(
         raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}; or give --shards")
     varied = checked_randomization(randomization)
     if randomization and not varied.moves_optima:
-        raise ValueError(f"{randomization} moves no optimum: its episodes have the optima without --randomization")
+        raise ValueError(
+            f"{randomization} changes no optimum, so its episodes have the usual optima; leave out --randomization"
+        )
     if shards is not None:
         _certify_shards(tasks, episodes, shards, out, workers, robot)
         return

@@ -84,7 +84,7 @@ def evaluate(
         _evaluate_fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
         return
     if optima:
-        raise ValueError("the optima of certified episodes are known; give --optima with --fresh")
+        raise ValueError("certified episodes already have optima; give --optima with --fresh")
     engine, count = physics_or_default(physics, robot), checked_episodes(episodes)
     settings = {"physics": engine, "episodes": count, "seed": seed}
     settings |= {"tracks": [randomization]} if randomization else {}

@@ -48,11 +48,11 @@ def new(kind: Kind, name: str, /, out: Path | None = None, episodes: int = 8) ->
     taken = name in TASKS or (kind == "system" and name in ROBOTS) or _id_of(kind, name) in gymnasium.registry
     if taken or _module_of(name) in _OURS:
         what = "task" if kind == "task" else "task or robot"
-        raise ValueError(f"there is a {what} {name!r} already, or a package of ours of that name; give another name")
+        raise ValueError(f"a {what}, or a package that ballbot-gym uses, is called {name!r} already; give another name")
     texts = _files_of(kind, name)
     if called := [each for each in _classes_of(kind, name) if each in _names_in(texts[f"{_module_of(name)}.py"])]:
         raise ValueError(
-            f"the {kind}'s class would be {called[0]!r}, which means something else there; give another name"
+            f"the {kind}'s class would be called {called[0]!r}, which its file uses for something else; give another name"
         )
     out = Path(name) if out is None else out
     if there := [path for path in (*texts, "leaderboard.md") if (out / path).exists()]:

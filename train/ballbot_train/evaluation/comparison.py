@@ -76,7 +76,9 @@ def compare(
     groups_a, groups_b = _groups(a[1]), _groups(b[1])
     pairs = _pairs(groups_a, groups_b, match)
     if not pairs:
-        raise ValueError(f"nothing in common: A has {_named(groups_a)}, B has {_named(groups_b)}")
+        raise ValueError(
+            f"A and B have no task and controller in common: A has {_named(groups_a)}, B has {_named(groups_b)}"
+        )
     return [
         _compare_one(
             task,
@@ -97,7 +99,7 @@ def _groups(results: Sequence[Result]) -> Groups:
     for result in results:
         group = groups.setdefault((result.task, result.controller), {})
         if result.episode in group:
-            raise ValueError(f"episode {result.episode} of {result.controller} on {result.task} is there twice")
+            raise ValueError(f"episode {result.episode} of {result.controller} on {result.task} occurs twice")
         group[result.episode] = result
     return groups
 

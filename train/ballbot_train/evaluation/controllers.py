@@ -265,8 +265,8 @@ def _acting(policy: Any, task: Task, params: Robot) -> Controller:
         function = cast(Callable[[np.ndarray], np.ndarray], policy)
         return ActionController(task, params, lambda observation, begins: function(observation))
     raise TypeError(
-        f"{policy!r} is no policy: give a Controller, a model with predict, a torch module or a function of the observation, "
-        "a name or a file"
+        f"{policy!r} is not a policy: give a Controller, a model with predict, a torch module or a function of the "
+        "observation, a name or a file"
     )
 
 
@@ -356,7 +356,7 @@ def controllers_of(
     """
     check_names("task", tasks, TASKS, least=1)
     if filter and not given:
-        raise ValueError("a filter needs controllers that it stands in front of; give --controllers with --filter")
+        raise ValueError("--filter needs to know which controllers get the filter; give --controllers too")
     given = [behind(name, filter) for name in given]
     track = None if tracks or given else ""
     known = {robot: {task: names(make_task(task, robot), robot, track) for task in tasks} for robot in robots}

@@ -226,8 +226,8 @@ class _Held:
         same = all(math.isclose(each.cost, costs.get(each.episode, each.cost), rel_tol=1e-6) for each in new)
         if row and not (held == file if held and file else same):
             raise ValueError(
-                f"{out} holds a row {name!r} on {task} of another policy, or of this one as it was; give this one another "
-                "name, or another out"
+                f"{out} holds a row {name!r} on {task} of another policy, or of an earlier version of this one; give this "
+                "one another name, or another out"
             )
         facts = {key: {**self.about.get(key, {}), **value} for key, value in more.items()}
         return [*(result for result in self.results if result not in row), *new], ran | facts

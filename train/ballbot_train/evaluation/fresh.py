@@ -305,7 +305,9 @@ def _acting(policy: Any, task: Task, robot: str) -> Any:
     if callable(getattr(policy, "predict", None)):
         return as_controller(policy, task, params)
     if not callable(policy):
-        raise TypeError(f"{policy!r} is no policy: give a name, a file, a model with predict, or a function of tensors")
+        raise TypeError(
+            f"{policy!r} is not a policy: give a name, a file, a model with predict, or a function of tensors"
+        )
     return policy
 
 

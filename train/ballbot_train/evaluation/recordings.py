@@ -117,10 +117,10 @@ def read(path: str | Path, content: bytes | None = None) -> Recording:
     if unknown := arrays.keys() - _ARRAYS:
         raise files.FileError(f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed")
     if missing := _ARRAYS - arrays.keys():
-        raise files.FileError(f"{path} is no recording: it has no array {', '.join(sorted(missing))}")
+        raise files.FileError(f"{path} is not a recording: it has no array {', '.join(sorted(missing))}")
     lengths, text = arrays["lengths"], arrays["about"]
     if lengths.dtype != np.uint32 or lengths.ndim != 1 or text.dtype != np.uint8 or text.ndim != 1:
-        raise files.FileError(f"{path} is no recording: lengths must be uint32 and about uint8, each of one axis")
+        raise files.FileError(f"{path} is not a recording: lengths must be uint32 and about uint8, each of one axis")
     steps = int(lengths.sum(dtype=np.int64))
     facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
     sizes = _sizes_of(facts, arrays)

@@ -254,7 +254,9 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
     robot = named_robot(facts["robot"])
     task = make_task(facts["task"], facts["robot"])
     if facts["problem"] != task.problem():
-        raise SubmissionError(f"{path} is of {facts['problem']}, and the certified episodes are of {task.problem()}")
+        raise SubmissionError(
+            f"{path} was recorded in {facts['problem']}, and the certified episodes are those of {task.problem()}"
+        )
     if len(recording.lengths) != episodes:
         raise SubmissionError(f"{path} holds {len(recording.lengths)} episodes, and not {episodes}")
     known = certified.load(task, robot, episodes=range(episodes))

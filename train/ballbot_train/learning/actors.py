@@ -110,11 +110,13 @@ def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
     start, informed = network.spec, network.spec.informed or mine.informed
     spec = replace(start, task=mine.task, robot=mine.robot, history=mine.history, informed=informed)
     if start.history > mine.history:
-        raise ValueError(f"the policy to start from sees {start.history} earlier observations; give --history")
+        raise ValueError(
+            f"the policy to start from observes {start.history} earlier steps; give --history {start.history}"
+        )
     if spec.informed != mine.informed:
-        raise ValueError("the policy to start from is informed of its robot's parameters; give --informed")
+        raise ValueError("the policy to start from receives the parameters of its robot; give --informed")
     if (spec.actions, spec.observations) != (start.actions, start.observations):
-        raise ValueError(f"a policy of {start.robot} cannot start one of {mine.robot}, which has other motors")
+        raise ValueError(f"a policy of {start.robot} cannot start a training for {mine.robot}, which has other motors")
     made = PolicyNetwork(spec)
     weights, shapes = network.state_dict(), made.state_dict()
     for name, weight in weights.items():

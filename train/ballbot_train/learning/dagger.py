@@ -427,7 +427,7 @@ def _demonstrations(
         raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
     if on_track:
         raise ValueError(
-            "demonstrations show no past and no track; leave out --demos, or --randomization and --history"
+            "demonstrations have no earlier observations and no track; leave out --demos, or --randomization and --history"
         )
     loaded = load_demos(demos, task, robot)
     weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))

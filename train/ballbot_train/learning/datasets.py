@@ -126,7 +126,7 @@ def _dataset(path: Path) -> dict[str, np.ndarray]:
     """
     main = path / "data" / "main_data.hdf5"
     if not main.is_file():
-        raise ValueError(f"{main} is no regular file")
+        raise ValueError(f"{main} is not a regular file")
     size, declared = main.stat().st_size, 0
     arrays: dict[str, list[np.ndarray]] = {name: [] for name in IN_DATASET}
     with h5py.File(main, "r") as file:
@@ -192,5 +192,5 @@ def metadata_of(path: str | Path) -> dict[str, Any]:
         if not isinstance(metadata.get("demos"), dict):
             raise ValueError("not made by ballbot demos")
     except ValueError as error:
-        raise ValueError(f'{path} is no dataset of "ballbot demos": {error}') from error
+        raise ValueError(f'{path} is not a dataset of "ballbot demos": {error}') from error
     return metadata

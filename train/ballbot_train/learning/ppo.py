@@ -218,9 +218,11 @@ class _Ppo(ModelFree):
         """See `Algorithm.make`. A policy to start from decides the shape of the actor."""
         warm = demos is not None or start is not None
         if warm and config.backwards:
-            raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")
+            raise ValueError("--backwards works only from scratch; give --no-backwards with --demos or --start")
         if config.backwards and config.relative_advantages:
-            raise ValueError("backwards shapes rewards, which tell no cost to go: give --no-relative-advantages too")
+            raise ValueError(
+                "--backwards shapes rewards, so that returns are not the cost to go: give --no-relative-advantages too"
+            )
         spec = spec_for(
             task, config.symmetry, config.hidden, history=world.get("history", 0), robot=registered_name(params)
         )

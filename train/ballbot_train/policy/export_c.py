@@ -70,7 +70,9 @@ def export_c(
             cannot be printed; or the prefix is no name in C.
     """
     if not re.fullmatch("[a-z][a-z0-9_]{0,30}", prefix):
-        raise ValueError(f"prefix must be small letters, digits and underscores, as left_leg, not {prefix!r:.100}")
+        raise ValueError(
+            f"prefix must be small letters, digits and underscores, for example left_leg, not {prefix!r:.100}"
+        )
     if policy == LQR:
         network, about = _lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
     else:
@@ -86,7 +88,9 @@ def _lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
     """
     found = equilibrium_gain(task, named_robot(robot))
     if found is None:
-        raise ValueError(f"LQR of {task.id} has other gains in each episode, so no C file can hold it; export a policy")
+        raise ValueError(
+            f"LQR of {task.id} has different gains in each episode, so it cannot be a C file; export a policy"
+        )
     network = PolicyNetwork(PolicySpec.of(task, robot=robot, hidden=(), linear=False, odd=True, squash="clip"))
     gain = np.zeros((network.spec.actions, network.spec.observations))
     gain[:, : found[0].shape[1]] = found[0]
@@ -126,7 +130,7 @@ def _filter(task: Task, params: Robot) -> dict[str, Any]:
     """What the template needs of `SensorFilter`."""
     if task.constant_names:
         raise ValueError(
-            f"where {task.id} starts depends on the episode, so no C file can hold the filter; leave out -ekf"
+            f"the start of {task.id} depends on the episode, so the filter cannot be in a C file; leave out -ekf"
         )
     sensor_filter = SensorFilter(task, params)
 

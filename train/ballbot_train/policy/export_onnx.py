@@ -68,7 +68,7 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
     described, params = PolicyFile(policy).read(), named_robot(robot)
     if described["spec"].get("informed"):
         raise PolicyError(
-            f"{policy} is informed of its robot by a filter, which cannot be exported; export another policy"
+            f"{policy} needs a filter that estimates its robot, and filters cannot be exported; export another policy"
         )
     learner = described.get("training", {}).get("learner", "unknown")
     return {

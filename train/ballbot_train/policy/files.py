@@ -214,17 +214,17 @@ class PolicyFile:
         """
         if Path(self.path).suffix in (".pt", ".pth", ".ckpt"):
             raise PolicyError(
-                f"{self.path} is no policy's .json, nor a model of Stable-Baselines3 in a .zip: load it where it was made, "
-                "and give ballbot_train.evaluate a function from observation to action"
+                f"{self.path} is neither a policy's .json nor a model of Stable-Baselines3 in a .zip: load it where it was "
+                "made, and give ballbot_train.evaluate a function from observation to action"
             )
         try:
             read = files.read_json(self.description, _DESCRIPTION_LIMIT)
             if not isinstance(read["spec"], dict):
-                raise TypeError("its spec is no object")
+                raise TypeError("its spec is not an object")
             if not isinstance(read["spec"]["task"], str):
                 raise TypeError("its spec names no task")
             if not isinstance(read.get("training", {}), dict):
-                raise TypeError("its training is no object")
+                raise TypeError("its training is not an object")
         except KeyError as error:
             raise PolicyError(f"{self.description} is not a policy: it has no {error}") from error
         except (ValueError, TypeError) as error:

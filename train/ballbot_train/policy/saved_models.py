@@ -214,14 +214,14 @@ def read(path: str | Path) -> _Saved:
         raise
     except Exception as error:  # torch has dozens of ways to refuse a damaged file
         reason = str(error) if isinstance(error, files.FileError) else f"{error!r:.300}"
-        raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {reason}") from error
+        raise PolicyError(f"{path} cannot be read as a saved model: {reason}") from error
 
 
 def _read_zip(path: Path) -> _Saved:
     members = files.unzipped(files.read(path), path)
     for name in ("data", "policy.pth"):
         if name not in members:
-            raise PolicyError(f"{path} is no saved Stable-Baselines3 model: it holds no {name}")
+            raise PolicyError(f"{path} is not a saved Stable-Baselines3 model: it holds no {name}")
     data = files.read_json(f"data in {path}", _DATA_LIMIT, members["data"])
     weights = saved_by_torch(members["policy.pth"], f"policy.pth in {path}")
     options, made_by = data.get("policy_kwargs") or {}, str(data["policy_class"].get("__module__", ""))
@@ -285,6 +285,6 @@ def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]
     )
     if not fitting or not shapes:
         raise PolicyError(
-            f"{path} is no network of linear layers that ends in actions: its weights and biases are {shapes!s:.200}"
+            f"{path} is not a network of linear layers that ends in actions: its weights and biases are {shapes!s:.200}"
         )
     return layers

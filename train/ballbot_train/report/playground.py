@@ -139,7 +139,9 @@ def _policies(given: Sequence[str]) -> dict[str, Path]:
 def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
     """The data of a policy, besides the printed functions."""
     if network.spec.seen != network.spec.observations:
-        raise PolicyError(f"{path} sees more than the present observation, and the page computes that alone")
+        raise PolicyError(
+            f"{path} needs a history or its robot's parameters, which the page does not compute; give another policy"
+        )
     name = str(PolicyFile(path).read().get("training", {}).get("learner", path.stem))
     return {
         "label": labels.label(name),

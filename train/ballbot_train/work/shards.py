@@ -151,7 +151,7 @@ def _place_of(url: str) -> tuple[Any, str]:
         return LocalFileSystem(), str(Path(url).absolute())
     if scheme not in _STORAGE or "::" in path:
         raise ValueError(
-            f"{scheme}:// is no storage; give a folder, or a URL that begins with one of {', '.join(_STORAGE)}"
+            f"{scheme}:// is not a supported storage; give a folder, or a URL that begins with one of {', '.join(_STORAGE)}"
         )
     return fsspec.core.url_to_fs(url)
 
