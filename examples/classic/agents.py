@@ -6,6 +6,7 @@
 Training needs Gymnasium and Stable-Baselines3 alone. Measuring needs the package `ballbot-classic`.
 """
 
+import csv
 import json
 import time
 from collections.abc import Callable
@@ -173,7 +174,7 @@ def by_hand(env: str) -> dict[str, Any]:
 def measure(
     env: str, /, out: Path = Path("runs/agents"), episodes: int = 200, controllers: tuple[str, ...] | None = None
 ) -> None:
-    """Measures the models of `train` and other controllers on certified episodes, and writes ENV.csv.
+    """Measures the models of `train` and other controllers on certified episodes, and writes ENV.csv. Its rows are kept.
 
     | column | meaning |
     |---|---|
@@ -190,15 +191,17 @@ def measure(
     """
     with BallbotEnv(env) as own:
         pay, others = own.task.survival_pay, by_hand(env)
-    entries: list[tuple[str, int | str, Any, dict[str, Any]]] = [
+    entries: list[tuple[str, str, Any, dict[str, Any]]] = [
         (each, "", others[each], {}) for each in (others if controllers is None else controllers)
     ]
     for agent in AGENTS:
         for path in sorted(out.glob(f"{env}-{agent}-*.zip")):
             about = json.loads(path.with_suffix(".json").read_text())
-            entries.append((agent, int(path.stem.rpartition("-")[2]), loaded(path, env, agent), about))
-    rows = []
-    for agent, seed, policy, about in entries:
+            entries.append((agent, path.stem.rpartition("-")[2], loaded(path, env, agent), about))
+    table = out / f"{env}.csv"
+    rows: list[dict[str, Any]] = list(csv.DictReader(table.open())) if table.exists() else []
+    known = {(row["agent"], row["seed"]) for row in rows}
+    for agent, seed, policy, about in (entry for entry in entries if entry[:2] not in known):
         row = evaluate(policy, env, episodes, physics="rk4", name=agent)
         best = row.cost_mean - row.excess_mean
         rows.append(
@@ -218,7 +221,7 @@ def measure(
             }
         )
         print(rows[-1], flush=True)
-    files.write_csv(out / f"{env}.csv", rows)
+        files.write_csv(table, rows)
 
 
 if __name__ == "__main__":
