@@ -2,6 +2,7 @@
 
     python examples/classic/agents.py train Pendulum-v1 ppo --seeds 0 1 2
     python examples/classic/agents.py measure Pendulum-v1
+    python examples/classic/agents.py table runs/agents/Pendulum-v1.csv
 
 Training needs Gymnasium and Stable-Baselines3 alone. Measuring needs the package `ballbot-classic`.
 """
@@ -162,12 +163,14 @@ def acts_at_random(env: str) -> Callable[[np.ndarray], np.ndarray]:
 
 def by_hand(env: str) -> dict[str, Any]:
     """Controllers without learning, by name, that act on an environment."""
-    known: dict[str, Any] = {"random": acts_at_random(env), "lqr": "lqr", "nmpc": "nmpc", "optimum": "optimum"}
+    known: dict[str, Any] = {"random": acts_at_random(env), "lqr": "lqr", "nmpc": "nmpc"}
     if env == "Pendulum-v1":
         from ballbot_classic.pendulum import EnergyShaping
 
         with BallbotEnv(env) as own:
             known["energy shaping"] = EnergyShaping(own.task, own.params)
+    if env == "MountainCarContinuous-v0":
+        known["along the speed"] = lambda observation: np.sign(observation[1:])  # with all of the force
     return known
 
 
@@ -198,31 +201,62 @@ def measure(
         for path in sorted(out.glob(f"{env}-{agent}-*.zip")):
             about = json.loads(path.with_suffix(".json").read_text())
             entries.append((agent, path.stem.rpartition("-")[2], loaded(path, env, agent), about))
-    table = out / f"{env}.csv"
-    rows: list[dict[str, Any]] = list(csv.DictReader(table.open())) if table.exists() else []
+    data = out / f"{env}.csv"
+    rows: list[dict[str, Any]] = list(csv.DictReader(data.open())) if data.exists() else []
     known = {(row["agent"], row["seed"]) for row in rows}
     for agent, seed, policy, about in (entry for entry in entries if entry[:2] not in known):
         row = evaluate(policy, env, episodes, physics="rk4", name=agent)
         best = row.cost_mean - row.excess_mean
-        rows.append(
-            {
-                "env": env,
-                "agent": agent,
-                "seed": seed,
-                "steps": about.get("steps", ""),
-                "cpu_seconds": about.get("cpu_seconds", ""),
-                "episodes": episodes,
-                "return_mean": f"{pay - row.cost_mean:.3f}",
-                "gap_mean": f"{row.excess_mean:.3f}",
-                "regret": f"{row.excess_mean / best:.4f}",
-                "regret_median": f"{row.regret_median:.4f}",
-                "success": f"{row.success:.3f}",
-                "failures": row.falls,
-            }
-        )
+        of = {"env": env, "agent": agent, "seed": seed}
+        of |= {"steps": about.get("steps", ""), "cpu_seconds": about.get("cpu_seconds", ""), "episodes": episodes}
+        figures = {
+            "return_mean": pay - row.cost_mean,
+            "gap_mean": row.excess_mean,
+            "regret": row.excess_mean / best,
+            "regret_median": row.regret_median,
+            "success": row.success,
+        }
+        if not rows:
+            optimum = {"return_mean": pay - best, "gap_mean": 0.0, "regret": 0.0, "regret_median": 0.0}
+            rows.append({**of, "agent": "optimum", **_rounded(optimum), "success": ""})
+        rows.append({**of, **_rounded(figures)})
         print(rows[-1], flush=True)
-        files.write_csv(table, rows)
+        files.write_csv(data, rows)
+
+
+def _rounded(figures: dict[str, float]) -> dict[str, str]:
+    return {name: f"{value:.4f}" for name, value in figures.items()}
+
+
+_SHOWN = {
+    "mean return": ("return_mean", "{:.2f}"),
+    "below the optimum": ("gap_mean", "{:.2f}"),
+    "regret": ("regret", "{:.1%}"),
+    "median regret": ("regret_median", "{:.1%}"),
+}
+"""Columns of a page's table: the column of the data, and its form."""
+
+
+def table(path: Path, /) -> None:
+    """Prints a table of `measure` in Markdown, with the range over seeds, the best agent first."""
+    print(markdown(path))
+
+
+def markdown(path: Path) -> str:
+    """What `table` prints."""
+    agents: dict[str, list[dict[str, str]]] = {}
+    for row in csv.DictReader(path.open()):
+        agents.setdefault(row["agent"], []).append(row)
+    lines = [f"| agent | seeds | {' | '.join(_SHOWN)} |", f"|---|---|{'---|' * len(_SHOWN)}"]
+    for agent, rows in sorted(agents.items(), key=lambda entry: min(float(row["gap_mean"]) for row in entry[1])):
+        cells = []
+        for column, form in _SHOWN.values():
+            values = sorted(float(row[column]) for row in rows)
+            shown = dict.fromkeys(form.format(value).replace("%", " %") for value in (values[0], values[-1]))
+            cells.append(" to ".join(shown).replace("-", "−"))
+        lines.append(f"| {agent} | {len(rows) if rows[0]['seed'] else ''} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"train": train, "measure": measure})
+    tyro.extras.subcommand_cli_from_dict({"train": train, "measure": measure, "table": table})
