@@ -37,8 +37,8 @@ class ActionController:
     """A function from observation to action as a Controller. It computes the observations that the env would return.
 
     `action` is the function, and `history` the number of earlier observations that it takes. It acts in B episodes at once,
-    given states (B, 8) and constants (B, nc), if the function takes observations (B, no). If `told` is set, (..., 3), these
-    estimates of the three factors in `ROBOT_FACTORS` are appended to the observation.
+    given states (B, 8) and constants (B, nc), if the function takes observations (B, no). If `estimates` is set, (..., 3),
+    these estimates of the three factors in `ROBOT_FACTORS` are appended to the observation.
     """
 
     def __init__(self, task: Task, params: Robot, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0):
@@ -53,7 +53,7 @@ class ActionController:
         self._task, self._params, self.action, self.history = task, params, action, history
         self._c: tuple[float, ...] = ()
         self._begins = True
-        self.told: np.ndarray | None = None
+        self.estimates: np.ndarray | None = None
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._begins = _components(c), True
@@ -64,8 +64,8 @@ class ActionController:
             still = np.zeros((*own.shape[:-1], self._params.action_size), np.float32)
             self._past = np.tile(np.concatenate([own, still], -1), self.history)
         observation = np.concatenate([own, self._past], -1) if self.history else own
-        if self.told is not None:
-            observation = np.concatenate([observation, self.told.astype(np.float32)], -1)
+        if self.estimates is not None:
+            observation = np.concatenate([observation, self.estimates.astype(np.float32)], -1)
         action = real_array(self.action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
         if self.history:

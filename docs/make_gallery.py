@@ -1,9 +1,9 @@
 """Films of certified episodes for gallery.md and leaderboard.md, which list them, and regret.png: make gallery.
 
 Each row of the leaderboard has a film of its best and of its worst episode. The gallery shows one episode of each task under
-four rows, and the worst one of the best policy. A film is made where there is none of the row's submission. It shows what the
-submission beside the row holds, or else the shipped controller of the row's name. pictures/films/made.json says of which
-submission each film is, how wide it is, and how the episode ended.
+four rows, and the worst one of the best policy. A film is made if there is none of the row's submission. It shows the motion
+of the submission next to the row, or else that of the shipped controller of the row's name. pictures/films/made.json says
+which submission each film shows, how wide it is, and how the episode ended.
 """
 
 import io
@@ -79,7 +79,7 @@ def page(notes: dict[str, dict[str, str]]) -> str:
 
 
 def _has_motion(row: Entry) -> bool:
-    """Whether a submission lies beside the row, or a shipped controller has its name."""
+    """Whether there is a submission next to the row, or a shipped controller of its name."""
     shipped = row.name in CONTROLLERS or (SHIPPED / f"{row.task}-{row.name}.json").exists()
     return shipped or (LEADERBOARD / row.file).with_suffix(".npz").exists()
 

@@ -1,7 +1,7 @@
 """Draws the documentation's pictures and films that `ballbot` makes, and writes down which policies they show.
 
 `make pictures` makes those that show other policies than the shipped ones, or were made by another command. Names make these
-in any case: `python docs/make_pictures.py basins.png lean.webp`. What is interrupted goes on where it was.
+in any case: `python docs/make_pictures.py basins.png lean.webp`. Started again, an interrupted run continues.
 
 pictures/made.json has each picture's command, and the SHA-256 of the weights of every learned policy that it shows; a test
 compares them with the policies that come with the package. Scripts in benchmarks/ draw their figures themselves, and learning

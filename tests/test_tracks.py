@@ -1,4 +1,4 @@
-"""Controllers on robots that nobody told them."""
+"""Controllers on unknown robots, delays and sensor errors."""
 
 import csv
 from dataclasses import replace

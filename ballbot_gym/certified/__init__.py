@@ -116,8 +116,9 @@ def named_problem(task: str, robot: str) -> dict[str, str]:
 
 
 def path_of(task: Task, robot: str = PAPER, track: str = "") -> Path:
-    """Where the package of a task keeps the evaluation set of the task, a robot by name and a track: here, or in the folder
-    `certified` beside the module of a task from outside.
+    """The path of the evaluation set of a task, a robot by name and a track.
+
+    It is in this folder; for a task of another package, in the folder `certified` next to the module of the task.
     """
     folder, kind = Path(__file__).parent, type(task)
     if kind not in SHIPPED:

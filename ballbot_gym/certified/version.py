@@ -5,7 +5,7 @@ CONTRIBUTING.md says when this version changes, and when an id such as `BallbotT
 """
 
 BENCHMARK = "1"
-"""Raised whenever an episode, a cost, a limit, an observation or an optimum changes, as a test of the digest of all tells."""
+"""Increased whenever an episode, a cost, a limit, an observation or an optimum changes; a test compares a digest of all."""
 
 
 def check(found: object, what: object, remedy: str) -> None:

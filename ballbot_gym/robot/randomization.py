@@ -24,7 +24,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Randomization:
-    """What varies, and how far. By default nothing varies. Ranges are (low, high), drawn uniformly.
+    """The parameters that vary, and by how much. By default nothing varies. Ranges are (low, high), drawn uniformly.
 
     Cost, margins, goal and `info["state"]` use the true state and the force that the actuator applies. Tasks draw their
     episodes for the nominal robot. Pushes do not count as effort.
@@ -324,8 +324,9 @@ TRACKS: dict[str, Randomization] = {
         odometry_drift=0.003,
     ),
 }
-"""Randomizations by name. What "unknown" and "late" draw is not observed. The friction of "unknown" is 0.55 to 1.0 where a
-rolling robot's is 0.8. No track has an actuator that lags: its optimum would be that of another problem."""
+"""The tracks: randomizations by name. Controllers do not observe what "unknown" and "late" draw. On "unknown", the friction
+of a rolling robot, which is usually 0.8, is 0.55 to 1.0. No track has an actuator that lags, because the optimum would then
+have to be computed for another model."""
 TRACKS["real"] = replace(
     TRACKS["noisy"],
     **{name: getattr(TRACKS["unknown"], name) for name in ("body_mass", "com_height", "force", "friction")},

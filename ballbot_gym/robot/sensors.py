@@ -1,12 +1,13 @@
-"""What a robot with wheels measures of itself: gyroscope, accelerometer and wheel encoders. These readings replace its state.
+"""The sensors of a robot with wheels: gyroscope, accelerometer and wheel encoders. Their readings replace its state.
 
 Gyroscope and accelerometer sit at the body's centre of mass, along the axes of the body. Both are sampled at 200 Hz, and the
-robot sees their mean over each control step, with the noise of that mean. The mean is Simpson's of the step's beginning,
-middle and end, and the middle is interpolated. The accelerometer reads R⊤ (a + g e_z): g upwards, if the body stands still.
-The encoders count whole ticks of each wheel against the body. In all of it the ball rolls without slipping.
+observation is their mean over each control step, with the noise of that mean. The mean is computed by Simpson's rule from the
+beginning, the middle and the end of the step; the middle is interpolated. The accelerometer reads R⊤ (a + g e_z), which is g
+upwards if the body stands still. The encoders count whole ticks of each wheel relative to the body. The sensor model assumes
+that the ball rolls without slipping.
 
-At the start of an episode the sensors read what they would if the wheels had not been driven. The start position is
-observed, because the goal of a task is a place. Leans, speeds and later positions are not observed.
+The first readings of an episode are those of a robot whose wheels are not driven. The start position is observed, because
+the goal of a task is a place. Leans, speeds and later positions are not observed.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Shapes: what is drawn of a robot, as plain data that every renderer draws."""
+"""Shapes of a robot in pictures, as plain data for every renderer."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Markers: what a task draws besides the robot."""
+"""Markers: the objects of a task in pictures, such as obstacles and goals."""
 
 from dataclasses import dataclass
 

@@ -68,8 +68,8 @@ class FilteredController:
 
     def _adapt(self, t: float) -> None:
         """Passes the present estimates of the robot to the controller."""
-        if getattr(self._controller, "told", None) is not None:
-            self._controller.told = self.filter.factors  # pyright: ignore[reportAttributeAccessIssue]
+        if getattr(self._controller, "estimates", None) is not None:
+            self._controller.estimates = self.filter.factors  # pyright: ignore[reportAttributeAccessIssue]
 
     def _when_free(self, t: float) -> Any:
         """When the next command will begin to act, s; (B,) of B episodes."""

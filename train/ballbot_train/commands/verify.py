@@ -48,6 +48,8 @@ def print_entries(entries: Sequence[submissions.Entry]) -> None:
     known = submissions.read_entries() if entries else []
     for entry in entries:
         if of := entry.copies(known):
-            console.print(f"{entry.name}: the costs are those of {', '.join(of)} to 1e-6; is it the same motion?")
+            console.print(
+                f"{entry.name}: its costs agree with those of {', '.join(of)} to 1e-6; is it the same motion?"
+            )
         if entry.optima:
-            console.print(f"{entry.name}: {entry.optima} episodes are the certified optimal motions to 1e-6")
+            console.print(f"{entry.name}: {entry.optima} motions agree with the certified optimal motions to 1e-6")

@@ -1,7 +1,8 @@
 """Two benchmarks of the same episodes, compared pair by pair: better, worse, or cannot tell.
 
-Both runs met the same episodes, so each episode is compared with itself, and how hard it is cancels. The mean difference per
-episode and its 95 % bootstrap interval are reported. They decide only beyond a margin:
+Both runs have the same episodes, so the results of each episode are compared with each other, and the difficulty of the
+episode cancels. The mean difference per episode and its 95 % bootstrap interval are reported. A difference counts only if it
+exceeds a margin:
 
 - Success decides first, if a sign test over the episodes in which only one of the two succeeded agrees, because the bootstrap
   interval of a handful of falls is too narrow. Otherwise regret decides, over the episodes in which neither failed.
@@ -32,7 +33,7 @@ _SAME_OPTIMUM = 1e-6  # relative; beyond this, two episodes of the same number a
 
 @dataclass(frozen=True)
 class Comparison:
-    """One controller on one task: what B is more than A. Success and regret are fractions."""
+    """One controller on one task: the result of B minus that of A. Success and regret are fractions."""
 
     task: str
     controller: str

@@ -21,7 +21,7 @@ from ballbot_train.policy.files import PolicyError, PolicyFile, shipped_policies
 from ballbot_train.work.console import check_names
 
 _SENSORS = "ekf"
-"""The filter for robots with wheels: it makes the state from sensors."""
+"""The filter for robots with wheels: it estimates the state from sensor readings."""
 
 
 def _experts() -> ModuleType:
@@ -186,7 +186,7 @@ def make_controller(name: str, task: Task, params: Robot) -> Controller:
         name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
             or of a model that Stable-Baselines3 saved; see `saved_models`. A filter may follow, see `split`.
         task: what it is to do.
-        params: the robot it believes to control.
+        params: the robot that it is made for.
 
     Raises:
         ValueError: nothing of that name.
@@ -196,7 +196,7 @@ def make_controller(name: str, task: Task, params: Robot) -> Controller:
         return _experts().VARIANTS[name](task, params)
     alone, filter = split(name)
     controller = _unfiltered(alone, task, params)
-    if getattr(controller, "told", None) is not None:  # it needs an estimate of the robot
+    if getattr(controller, "estimates", None) is not None:  # it needs an estimate of the robot
         filter = filter or "adaptive"
     return _filtered(controller, filter, task, params)
 
@@ -232,7 +232,7 @@ def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
 
 
 def as_controller(policy: Any, task: Task, params: Robot, filter: str | None = None) -> Controller:
-    """Anything that acts, as a Controller.
+    """Any policy or controller as a Controller.
 
     Args:
         policy: a Controller; a Stable-Baselines3 model that was trained in the env's own spaces, whose VecNormalize is
@@ -240,8 +240,8 @@ def as_controller(policy: Any, task: Task, params: Robot, filter: str | None = N
             tuple that begins with one; a torch module from observations (B, no) to actions (B, 2); a function from
             observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
         task: what it is to do.
-        params: the robot that it believes to control.
-        filter: one of `_filters` that stands in front of it.
+        params: the robot that it is made for.
+        filter: name of a filter in front of it.
 
     Raises:
         TypeError: it is none of these.

@@ -21,12 +21,12 @@ _LEADERBOARD = "leaderboard"
 SMALL = 0.01
 """An optimum below this share of the mean optimum is nearly 0."""
 NEAR = 3.0
-"""An episode without failure ends near the goal if its end is within so many times the goal's tolerances."""
+"""An episode without failure ends near the goal if its last state is within this multiple of the goal's tolerances."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """One certified episode under one controller; SI units, angles in degrees. Without a trajectory measures are NaN."""
+    """One certified episode under one controller; SI units, angles in degrees. If there is no trajectory, numbers are NaN."""
 
     task: str
     controller: str
@@ -48,13 +48,13 @@ class Result:
     violated: str = ""
     """Name of the limit at which the episode failed, such as "tilt"."""
     note: str = ""
-    """Why there is no trajectory: the message of the controller that found no plan."""
+    """The reason why there is no trajectory: the message of the controller that found no plan; else ""."""
     labels: Mapping[str, Any] = field(default_factory=dict)
     """Further labels of the episode, such as a disturbance. Each is a column of its own in files."""
 
     @property
     def regret(self) -> float:
-        """cost / optimum − 1; NaN for a failed episode, whose cost is a price and not a performance."""
+        """cost / optimum − 1; NaN for a failed episode, because most of its cost is the price of the failure."""
         return math.nan if self.failure else self.cost / self.optimum - 1
 
 
@@ -79,7 +79,7 @@ class Row(Displayed):
     regret_high: float
     regret_median: float
     excess_mean: float
-    """Mean of cost − optimum, in the unit of the cost: what to look at where some optima are nearly 0."""
+    """Mean of cost − optimum, in the unit of the cost; use it instead of the regret if some optima are nearly 0."""
     cost_mean: float
     cost_median: float
     peak_tilt_median: float

@@ -11,7 +11,7 @@ it. In units of that optimum J, regret is the sum of two parts:
 - what the hidden parameters cost: how far the best controller of the table is from J in the same episode,
 - what the controller adds: how much more it costs than that best controller.
 
-What delay costs is a column of its own, because no controller could avoid it: J minus the optimum without delay.
+A separate column shows the cost of delay, which is J minus the optimum without delay, because no controller can avoid it.
 """
 
 import math

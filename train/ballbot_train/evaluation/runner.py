@@ -1,4 +1,4 @@
-"""Runs controllers on episodes: the certified ones of a task, or from states of one's own, in any world.
+"""Runs controllers on the certified episodes of a task, or from given states, with any robot and engine.
 
 `run_episodes` runs one controller in one environment. `run_groups` runs many in parallel processes, resumably. Everything
 that measures episodes one by one does so through these: `evaluate`, and the commands benchmark, evaluate, robustness,

@@ -149,7 +149,7 @@ class _Optima:
 
 @dataclass
 class _Labels(Samples):
-    """Samples, of which those near optima label the states around them too.
+    """Samples. Those near optima label the states around them too.
 
     | field | shape | meaning |
     |---|---|---|

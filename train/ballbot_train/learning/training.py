@@ -1,13 +1,12 @@
 """Training runs: any learner with progress, TensorBoard, evaluation, checkpoints and resumption.
 
-Two sets of episodes evaluate a policy while it learns. The validation set, 200 fresh episodes, chooses the run's best policy.
-The certified episodes are the test set: what a policy does on them is reported, and decides nothing. So the reported
-figures are no better than those of other episodes.
+A policy is evaluated on two sets of episodes while it learns. On the validation set, which has 200 fresh episodes by default,
+the best policy of the run is chosen. The certified episodes are the test set: their results are reported, and are not used to
+choose a policy. So the choice does not make the reported figures too good.
 
-The policy with the least mean cost on the validation set is the best. This is what the task asks for: costs are the task's
-own, with the price that it sets for failing, and an episode that ends without success costs at least as much as failing at
-once. All policies of a run meet the same episodes, so their costs compare without a reference. The optima of these episodes
-are not known. The cost of another controller would be no substitute: each fails in some of the episodes.
+The best policy has the least mean cost on the validation set. The cost is the task's own, with its price of a failure, and an
+episode without success costs at least as much as an immediate failure. All policies of a run are evaluated on the same
+episodes, so their costs can be compared without the optima of these episodes, which are not computed.
 
 A run is a folder:
 
@@ -75,8 +74,8 @@ class Learner(Protocol):
     `state_dict` holds everything that a later iteration depends on. So a resumed learner does exactly what it would have
     done without the interruption.
 
-    It may also have `preparation`, a number of iterations with which it begins by something else, as imitation: a run keeps
-    a policy of theirs only as long as there is no later one. And `difficulty`, how far its curriculum has come, by name.
+    It may also have `preparation`, the number of its first iterations that do something else, such as imitation: a policy of
+    these iterations is the best one only until there is a later one. And `difficulty`, the state of its curriculum, by name.
     """
 
     iteration: int

@@ -38,8 +38,8 @@ with imports_of(__name__):
 if TYPE_CHECKING:
     from ballbot_gym.vector.batch import BatchState
 
-_TOLD = len(ROBOT_FACTORS)
-_TOLD_SCALE = 0.3  # of the robot's parameters minus 1, as inputs of informed policies
+_FACTORS = len(ROBOT_FACTORS)
+_FACTOR_SCALE = 0.3  # of the robot's parameters minus 1, as inputs of informed policies
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
 
 
@@ -60,7 +60,7 @@ class PolicyNetwork(torch.nn.Module):
         super().__init__()
         self.spec = spec
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
-        unchanged, none = [1] * _TOLD * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
+        unchanged, none = [1] * _FACTORS * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
         self._mirrors = [
             (
                 torch.tensor([*signs, *(spec.history * (*signs, *action)), *unchanged], **own),
@@ -74,7 +74,7 @@ class PolicyNetwork(torch.nn.Module):
         self.routes = None
         if self._frame is not None and self._frame.route is not None:
             self.routes = Routes(self._frame.route, spec.routes, device)
-        inputs = self.present + spec.history * (self.present + spec.actions) + _TOLD * spec.informed
+        inputs = self.present + spec.history * (self.present + spec.actions) + _FACTORS * spec.informed
         self.linear = torch.nn.Linear(inputs, spec.actions, bias=not spec.odd, **own) if spec.linear else None
         widths = (inputs, *spec.hidden, spec.actions)
         self.mlp = linear_layers(widths, _ACTIVATIONS[spec.activation], bias=not spec.odd, **own)
@@ -107,7 +107,7 @@ class PolicyNetwork(torch.nn.Module):
         """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
         estimates = observation[..., :0]
         if self.spec.informed:
-            observation, estimates = observation[..., :-_TOLD], (observation[..., -_TOLD:] - 1.0) / _TOLD_SCALE
+            observation, estimates = observation[..., :-_FACTORS], (observation[..., -_FACTORS:] - 1.0) / _FACTOR_SCALE
         if self._frame is not None:
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             plain = observation.ndim == 1 and torch.is_inference_mode_enabled()
@@ -235,7 +235,7 @@ class PolicyController(ActionController):
         super().__init__(task, params, self._action_for, history)
         self.network = network.eval()
         if isinstance(network, PolicyNetwork) and network.spec.informed:
-            self.told = np.ones(_TOLD)
+            self.estimates = np.ones(_FACTORS)
 
     def _action_for(self, observation: np.ndarray, begins: bool) -> np.ndarray:
         return self.predict(observation)[0]

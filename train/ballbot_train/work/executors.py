@@ -39,7 +39,7 @@ Key = TypeVar("Key")
 
 
 class WorkerError(RuntimeError):
-    """A worker died, on a cluster several in turn at one task; or there is no cluster."""
+    """A worker died; or, on a cluster, several workers died at the same task; or there is no cluster."""
 
 
 @dataclass(frozen=True)

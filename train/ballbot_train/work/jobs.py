@@ -1,4 +1,4 @@
-"""Work that outlives an interruption: jobs on parallel workers, whose results are kept as they come.
+"""Work that can be interrupted and continued: jobs on parallel workers, whose results are written as soon as they arrive.
 
 Each finished job is one file of JSON, with an entry for every item. Workers compute and this process writes, so workers may
 be on other machines; `executors` says where. A run that is killed at any moment and started again therefore does only the
