@@ -17,7 +17,7 @@ from ballbot_classic.replay import followed
 from minari.data_collector import EpisodeBuffer
 
 from ballbot_baselines import find_optimum
-from ballbot_gym import BallbotEnv
+from ballbot_gym import TASKS, BallbotEnv
 
 
 def recorded(env: gymnasium.Env, actions: Iterable[np.ndarray], seed: int) -> EpisodeBuffer:
@@ -58,13 +58,14 @@ def main(id: str, /, episodes: int = 200, name: str | None = None) -> minari.Min
     """
     register()
     env, optima = gymnasium.make(id), []
+    (task,) = (name for name, kind in TASKS.items() if kind.counterpart == id)
     with BallbotEnv(id) as own:
         for seed in range(episodes):
             _, info = own.reset(seed=seed)
             optima.append(find_optimum(own.task, own.params, info["state"], info["constants"], twice=True))
     dataset = minari.create_dataset_from_buffers(
         name or f"{id.rpartition('-')[0].lower()}/optimum-v0",
-        [recorded(env, followed(id, optimum, seed), seed) for seed, optimum in enumerate(optima)],
+        [recorded(env, followed(task, optimum, seed), seed) for seed, optimum in enumerate(optima)],
         env,
         algorithm_name="optimum of ballbot-classic",
         ref_min_score=float(np.mean([random_return(env, seed) for seed in range(episodes)])),
