@@ -8,14 +8,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from builders import classic_systems
+from builders import CLASSIC, classic_systems
 
 import ballbot_baselines
 import ballbot_gym
 import ballbot_train
 from ballbot_baselines import VARIANTS, find_optimum, regret
 from ballbot_baselines.solvers.shooting import Backoff, Shooting
-from ballbot_gym import BallbotBatch, BallbotEnv, BallbotVectorEnv, named_robot, rollout
+from ballbot_gym import BallbotBatch, BallbotEnv, BallbotVectorEnv, certified, named_robot, rollout
 from ballbot_gym.env import make_task, robot_of
 from ballbot_gym.tasks.checks import check_methods
 from ballbot_train import RegretWrapper, evaluate
@@ -129,6 +129,17 @@ def test_many_cars_report_what_one_does(engine):
         np.testing.assert_allclose(infos["state"][n], info["state"], atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["pendulum", "cart_pole"])
+def test_the_package_brings_certified_sets(name, own_cache):
+    task, robot = make_task(name), robot_of(name)
+    known = certified.load(task, robot)
+    assert certified.path_of(task, name).parent == CLASSIC / "src" / "ballbot_classic" / "certified"
+    assert len(known) == 200
+    assert known.violations.max() < 1e-6
+    for seed in (0, 199):
+        np.testing.assert_array_equal(known.states[seed], certified.cache.episode(task, robot, seed)[0])
+
+
 def test_the_angle_may_wrap_and_the_rate_be_clipped_along_the_optimum():
     hanging, fast = optimum_of_seed("pendulum", 2).trajectory.x, optimum_of_seed("pendulum", 8).trajectory.x
     assert abs(hanging[-1, 0]) == pytest.approx(2 * math.pi)
@@ -183,7 +194,7 @@ def test_the_wrapper_reports_the_regret_of_every_episode(own_cache):
         assert info["optimum"] == pytest.approx(-best)
         assert info["gap"] == pytest.approx(-best - total)
         assert info["regret"] == pytest.approx(-total / best - 1)
-    assert len(list(own_cache.rglob("starts/*.json"))) == 2
+    assert len(list(own_cache.rglob("starts/*.json"))) == 1  # the other is in the certified set
 
 
 def test_the_wrapper_takes_own_environments_and_many_at_once(own_cache):

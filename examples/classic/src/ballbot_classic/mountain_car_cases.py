@@ -18,8 +18,8 @@ from ballbot_baselines import Ocp, OcpSolver, Solution
 
 Guesses = list[tuple[np.ndarray, np.ndarray]]
 
-_SOLVED = 4  # guesses, of other numbers of turns
-_WORSE = 1.05  # times the best solution: where others cost more, better times do not make up for it
+_SOLVED = 3  # guesses, of other numbers of turns
+_WORSE = 1.03  # times the best solution: where others cost more, better times do not make up for it
 _NEAR_STEPS = 20  # solutions that turn as often and arrive within these steps become the same at their best times
 _BARRIER, _NEAR_BARRIER = 1e-3, 1e-6  # of the first iterate, and near a solution
 _STRIDE = 4  # of the search for the best time at first, control steps
@@ -42,10 +42,8 @@ def solutions(task: Any, episode: Any, guesses: Guesses | None = None) -> list[S
     search = _Search(task, episode.params, episode.backoff.force)
     guesses = _different(task.guesses(episode.x0, episode.c, episode.params) if guesses is None else guesses)
     found = search.against_the_wall(guesses[:_SOLVED])
-    if not found:
-        return [search.best_time(search.solved(*guess)) for guess in guesses[:_SOLVED]]
-    best = min(found, key=lambda each: each.cost)
-    return [*found, search.solved(*search.motion(best), near=True)]
+    # where the wall may stop the car, that is cheaper than to turn in front of it: the motion is freer
+    return found or [search.best_time(search.solved(*guess)) for guess in guesses[:_SOLVED]]
 
 
 def _different(guesses: Guesses) -> Guesses:
@@ -125,21 +123,22 @@ class _Search:
 
     def against_the_wall(self, guesses: Guesses) -> list[Solution]:
         """The best that the wall stops once, where the guesses last turn."""
-        after, found = _from_wall(self._task, self._params, self._backoff), list[Solution]()
-        at_wall, tried, least = np.array([[-self._params.reach, 0.0]]), list[tuple[int, int]](), math.inf
+        after, begun = _from_wall(self._task, self._params, self._backoff), list[Solution]()
+        at_wall, tried = np.array([[-self._params.reach, 0.0]]), list[tuple[int, int]]()
         for x, u in guesses:
             turned = np.flatnonzero((x[1:-1, 1] <= 0) & (x[2:, 1] > 0))
             if not len(turned):
                 continue
             last = min(int(turned[-1]) + 1, self._task.steps - len(after.inputs))
-            before = self.solved(np.concatenate([x[:last], at_wall]), u[:last], to_wall=True)
-            turns = _turns(before.states)
-            same = any(turns == other and abs(last - steps) <= _NEAR_STEPS for other, steps in tried)
-            if not before.is_optimal or same or before.cost + after.cost > _WORSE * least:
-                continue
-            tried.append((turns, last))
-            found += self._both(before, after)
-            least = min((each.cost for each in found), default=math.inf)
+            turns = _turns(x[:last])
+            if not any(abs(turns - other) <= 1 and abs(last - steps) <= _NEAR_STEPS for other, steps in tried):
+                tried.append((turns, last))
+                begun.append(self.solved(np.concatenate([x[:last], at_wall]), u[:last], to_wall=True))
+        found, least = list[Solution](), math.inf
+        for before in sorted((each for each in begun if each.is_optimal), key=lambda each: each.cost):
+            if before.cost + after.cost <= _WORSE * least:
+                found += self._both(before, after)
+                least = min((each.cost for each in found), default=math.inf)
         return found
 
     def _both(self, before: Solution, after: Solution) -> Iterator[Solution]:

@@ -27,6 +27,7 @@ _TURN = 2 * math.pi
 _FAMILIES = (
     ((2.0, 1.7, 1.4, 1.0), (1.0, -1.0), (0, 2, 4, 6, 8, 10, 14, 18), (0, 4, 8, 12, 16, 20), (0.0, 0.5, 1.0, 1.5)),
     ((2.0, 1.4), (1.0, -1.0), (0, 3, 6, 10, 14, 18), (0, 4, 8, 12, 16, 20), (0.0, 1.0)),
+    ((2.0,), (1.0, -1.0), range(21), range(26, 49), (0.0,)),  # all of the torque until upright
 )
 _RANDOM = 2000  # more swing-ups, after up to `_PUSHES` pushes of up to `_LONGEST` control steps
 _PUSHES, _LONGEST = 4, 24

@@ -22,7 +22,7 @@ from ballbot_baselines import Ocp, OcpSolver, Solution
 Guesses = list[tuple[np.ndarray, np.ndarray]]
 
 _TURN = 2 * math.pi
-_SOLVED = 160  # guesses
+_SOLVED = 400  # guesses
 _WORSE = 1.25  # times the best solution: guesses that cost more lead to no better one
 _ROUNDS = 60  # changes of the case, each by a control step or so
 _CHANGES, _CLIPS = 8, 3  # of the number of turns, and intervals of clipped rates, in an episode

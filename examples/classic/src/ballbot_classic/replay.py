@@ -1,11 +1,15 @@
-"""Replays optima in the environments of Gymnasium that pose the same problem as their tasks."""
+"""Replays optima in the environments of Gymnasium that pose the same problem as their tasks.
 
+python -m ballbot_classic.replay Pendulum-v1
+"""
+
+import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from ballbot_baselines import Optimum
+from ballbot_baselines import Optimum, find_optimum
 from ballbot_gym import TASKS, named_robot
 
 
@@ -50,3 +54,31 @@ def returned(id: str, actions: np.ndarray, seed: int, env: gymnasium.Env | None 
         _, reward, terminated, truncated, _ = env.step(action)
         total += float(reward)
     return total, terminated, truncated
+
+
+def main(id: str, episodes: int = 200) -> float:
+    """Replays the optima of the seeds from 0 on, and prints how far their returns are from the promised ones.
+
+    Args:
+        id: of the counterpart.
+        episodes: how many.
+
+    Returns:
+        the largest difference, relative to the promised return.
+    """
+    name, kind = next((name, kind) for name, kind in TASKS.items() if kind.counterpart == id)
+    task, robot, off = kind(), named_robot(kind.ROBOT), np.zeros(episodes)
+    for seed in range(episodes):
+        x, c = task.sample(np.random.default_rng(seed), robot)
+        optimum = find_optimum(task, robot, x, c)
+        promised = task.survival_pay - optimum.cost
+        earned, *_ = returned(id, followed(name, optimum, seed), seed)
+        off[seed] = abs(earned - promised) / abs(promised)
+    print(
+        f"{id}: {episodes} seeds, relative differences of returns: median {np.median(off):.1e}, at most {off.max():.1e}"
+    )
+    return float(off.max())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], *map(int, sys.argv[2:]))
