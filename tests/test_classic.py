@@ -129,7 +129,7 @@ def test_many_cars_report_what_one_does(engine):
         np.testing.assert_allclose(infos["state"][n], info["state"], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["pendulum", "mountain_car", "cart_pole"])
+@pytest.mark.parametrize("name", ["pendulum", "mountain_car", "cart_pole", "acrobot"])
 def test_the_package_brings_certified_sets(name, own_cache):
     task, robot = make_task(name), robot_of(name)
     known = certified.load(task, robot)

@@ -7,9 +7,12 @@ from builders import FunctionController
 
 from ballbot_baselines import LqrController, TrajoptController, TvlqrController, find_optimum
 from ballbot_baselines.solvers.riccati import discrete_lqr
+from ballbot_gym import certified
+from ballbot_gym.env import make_task
 from ballbot_gym.rollout import PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.evaluation.controllers import make_controller
 
 IDLE = FunctionController(lambda t, x: np.zeros(2))
 UPRIGHT = np.zeros(8)
@@ -104,6 +107,18 @@ def test_plan_tracked_in_bullet_succeeds_at_nearly_the_planned_cost(task, make_e
         episode = rollout(env, controller, seed=seed)
         assert episode.success
         assert episode.cost == pytest.approx(controller.plan.cost, rel=0.03)  # measured: 1.3e-3 with Bullet's 1 ms
+
+
+def test_the_optimum_of_a_certified_episode_is_the_certified_one(task, params, monkeypatch):
+    known, controller = certified.load(task, params), make_controller("optimum", make_task(task), params)
+    controller.reset(0.0, known.states[2], known.constants[2])
+    assert controller.plan.cost == known.costs[2]
+    np.testing.assert_array_equal(controller.plan.trajectory.u, known.trajectories[2].u)
+    beside = known.states[2] + 0.01
+    monkeypatch.setattr("ballbot_baselines.feedback.trajopt.plan_to_track", lambda *_, **__: 1 / 0)
+    for start in ((0.0, beside), (0.02, known.states[2])):
+        with pytest.raises(ZeroDivisionError):  # it is searched for
+            controller.reset(*start, known.constants[2])
 
 
 def test_plan_that_cannot_be_found_is_an_error_at_reset(make_env, params):

@@ -37,7 +37,7 @@ CONTROLLERS: dict[str, Callable[[Task, Robot], Controller]] = {
 
 _ADAPTIVE = called("ballbot_baselines.feedback.adaptive:AdaptiveNmpcController")
 VARIANTS: dict[str, Callable[[Task, Robot], Controller]] = {
-    "optimum": called("ballbot_baselines.feedback.trajopt:optimal_trajopt"),
+    "optimum": called("ballbot_baselines.feedback.trajopt:OptimumController"),
     "nmpc-offset-free": called("ballbot_baselines.feedback.nmpc:offset_free_nmpc"),
     "cautious": called("ballbot_baselines.feedback.trajopt:cautious_trajopt"),
     "nmpc-adaptive": partial(_ADAPTIVE, ending="-adaptive"),
