@@ -50,7 +50,7 @@ def compile_all(codes: list[generated.Code], folder: Path) -> None:
             with tempfile.TemporaryDirectory(dir=folder) as scratch:
                 built = Path(scratch) / f"code{machine_code.SUFFIX}"
                 flags = (*code.flags, *LEVEL_FLAGS[level])
-                machine_code.compile_library(program, code.source, built, flags, seconds=None)
+                machine_code.compile_library(program, code.source, built, flags, waits=True)
                 machine_code.kept(built, folder / level, code.stem)
         for stem in made.keys() - {code.stem for code in codes}:
             made[stem].unlink()

@@ -266,7 +266,7 @@ TRAJECTORIES = [
     (written(b"", Trajectory.load), "is not a valid .npz file"),
     (written(b"garbage" * 99, Trajectory.load), "is not a valid .npz file"),
     (written(npz(t=np.arange(3.0)), Trajectory.load), "it has no array x, u"),
-    (written(archive({"t.npy": npy(HUGE)}), Trajectory.load), "a damaged one"),
+    (written(archive({"t.npy": npy(HUGE)}), Trajectory.load), "not a trajectory file"),
     (written(archive({"t.npy": npy(HUGE.replace("<f8", "|O"))}), Trajectory.load), "Object arrays cannot be loaded"),
     (written(bomb(), Trajectory.load), "unpacks to 2384 MiB; at most 256 MiB are read"),
     (written(encrypted(), Trajectory.load), "t.npy is encrypted; write it without a password"),

@@ -160,7 +160,7 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng
 
 
 def test_a_policy_that_sees_more_than_the_present_is_refused():
-    with pytest.raises(PolicyError, match="more than the present observation"):
+    with pytest.raises(PolicyError, match="needs a history or its robot's parameters"):
         engine_script([str(SHIPPED / "turn-shac-informed-unknown.json")])
 
 

@@ -160,7 +160,7 @@ def test_costs_of_the_submitter_s_are_refused(submitted, tmp_path, forge):
         ({"name": "<b>mine</b>"}, "name must be of letters"),
         ({"name": "m" * 41}, "name must be text of at most 40"),
         ({"task": "os:system"}, "unknown task 'os:system'"),
-        ({"task": "orbit"}, "the certified episodes are of Orbit"),
+        ({"task": "orbit"}, "the certified episodes are those of Orbit"),
         ({"physics": "magic"}, "unknown physics"),
         ({"policy": "mine"}, "policy must be a SHA-256"),
         ({"versions": {"python": "3\n"}}, "versions must be short words"),

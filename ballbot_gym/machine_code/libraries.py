@@ -142,9 +142,7 @@ def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str
         return kept(built, folder, stem)
 
 
-def compile_library(
-    compiler: str, source: str, built: Path, flags: tuple[str, ...], seconds: float | None = _COMPILE_SECONDS
-) -> None:
+def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, ...], waits: bool = False) -> None:
     """Compiles C code to the shared library `built`. The code is saved in the same folder.
 
     Args:
@@ -152,7 +150,7 @@ def compile_library(
         source: the code.
         built: where the library is written.
         flags: of the compiler, besides those that every library needs.
-        seconds: after which it counts as hanging; None waits for as long as it takes.
+        waits: for as long as it takes; default, a compiler that takes minutes counts as hanging.
 
     Raises:
         subprocess.CalledProcessError: the compiler refuses the code or a flag.
@@ -161,7 +159,11 @@ def compile_library(
     code = built.with_suffix(".c")
     code.write_text(source, encoding="utf-8")
     own = flags if _is_gcc(compiler) else without_parameters(flags)
-    _run([compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES], seconds, check=True)
+    _run(
+        [compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES],
+        None if waits else _COMPILE_SECONDS,
+        check=True,
+    )
 
 
 def without_parameters(flags: tuple[str, ...]) -> tuple[str, ...]:

@@ -59,7 +59,9 @@ class OptimumController(TrajoptController):
         same = (known.states == x).all(1) & (known.constants == c).all(1) & np.isfinite(known.costs) & (t == 0)
         for i in np.flatnonzero(same[: len(known.trajectories)]):
             motion, status = known.trajectories[i], str(known.statuses[i])
-            if not np.allclose(motion.x[0], x, rtol=0, atol=1e-12):  # a set of the cache has the trajectories of some episodes alone
+            if not np.allclose(
+                motion.x[0], x, rtol=0, atol=1e-12
+            ):  # a set of the cache has the trajectories of some episodes alone
                 continue
             return Optimum(
                 cost=float(known.costs[i]),
