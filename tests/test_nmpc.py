@@ -33,6 +33,13 @@ def pushed(speed, lean_rate):
     return x
 
 
+def test_the_default_horizon_is_a_second_or_twenty_long_control_steps(params):
+    for control_dt, horizon in ((0.02, 1.0), (0.1, 2.0)):
+        task = Stabilize(control_dt=control_dt)
+        given, default = NmpcController(task, params, horizon=horizon), NmpcController(task, params)
+        np.testing.assert_array_equal(default._offsets, given._offsets)
+
+
 def test_horizon_must_be_whole_control_steps(params):
     with pytest.raises(ValueError, match=r"whole number of control steps of 0\.02 s, not 0\.03 s"):
         NmpcController(Stabilize(), params, horizon=0.03)

@@ -40,6 +40,7 @@ BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02, grip=0.1)
 """Of the plan; for the goal it is half of `TrajoptController`'s."""
 _OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # what is left of a wrong model
 _NODES = 40
+_FEWEST = 20  # control steps of the default horizon, for systems whose control steps are long
 _TOLERANCE = 1e-4  # a search has converged when no input changes by more than this fraction of the force limit
 
 
@@ -80,7 +81,7 @@ class NmpcController:
         task: Task,
         params: Robot,
         nodes: int | None = None,
-        horizon: float = 1.0,
+        horizon: float | None = None,
         iterations: int = 1,
         backoff: Backoff = BACKOFF,
         offset_free: bool = False,
@@ -90,7 +91,7 @@ class NmpcController:
         Args:
             nodes: intervals of the horizon, at most one per control step; default 40, or one per control step if friction is
                 limited, because the optimal forces then change from step to step along the friction cone.
-            horizon: s, a whole number of control steps.
+            horizon: s, a whole number of control steps; default 1 s, or 20 control steps if these are longer.
             iterations: largest number of iterations per control step: 1 is the real-time iteration; about 20 converge.
             backoff: distance of the plan from its limits; within the horizon, margins keep half of it.
             offset_free: whether to estimate how the robot's accelerations differ from the model's, and to correct the model.
@@ -100,6 +101,8 @@ class NmpcController:
         """
         self._task, self._params, self.backoff = task, params, backoff
         self._iterations, self._offset_free = iterations, offset_free
+        if horizon is None:
+            horizon = max(1.0, _FEWEST * task.control_dt)
         steps = round(horizon / task.control_dt)
         if steps < 0 or abs(steps * task.control_dt - horizon) > 1e-9:
             raise ValueError(f"horizon must be a whole number of control steps of {task.control_dt} s, not {horizon} s")
