@@ -144,8 +144,9 @@ def test_agents_are_trained_with_the_settings_of_the_zoo_and_measured(tmp_path, 
     assert float(rows["energy shaping"]["gap_mean"]) < float(rows["random"]["gap_mean"])
 
 
-@pytest.mark.parametrize("data", sorted(EXPERIMENTS.glob("classic-*.csv")), ids=lambda path: path.stem)
-def test_the_page_of_agents_shows_the_tables_of_its_data(data):
+@pytest.mark.parametrize("system", ["pendulum", "mountain-car"])
+def test_the_page_of_agents_shows_the_tables_of_its_data(system):
+    data = EXPERIMENTS / f"classic-{system}.csv"
     assert example("agents").markdown(data) in (EXPERIMENTS / "classic-agents.md").read_text()
 
 
