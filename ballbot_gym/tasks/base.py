@@ -183,9 +183,11 @@ class Task(ABC):
         return np.array(x, np.float64), np.array(c, np.float64)
 
     def episode_seed(self, index: int) -> tuple[int, ...]:
-        """What seeds the draw of episode `index` of the certified set. A task with a `counterpart` may return (index,): its
-        episodes are then those that both environments draw in `reset(seed=index)`.
+        """What seeds the draw of episode `index` of the certified set. The episodes of a task with a `counterpart` are those
+        that both environments draw in `reset(seed=index)`.
         """
+        if self.counterpart:
+            return (index,)
         return zlib.crc32(self.id.encode()), index
 
     def counterpart_state(self, env: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ the exact system, and improves that motion locally. It writes a line for each ep
 it draws the paths of a model of Stable-Baselines3 that was trained in Pendulum-v1, too.
 """
 
-import argparse
 import ctypes
 from dataclasses import dataclass
 from importlib import import_module
@@ -19,6 +18,7 @@ import ballbot_classic
 import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
+import tyro
 
 from ballbot_baselines import Backoff
 from ballbot_gym import TASKS, certified, files, machine_code, named_robot
@@ -106,19 +106,15 @@ class Grid:
             path.append(x.copy())
             taken.append(actions)
         if self._system.last_is_free:
-            angle = (x[:, 0] + np.pi) % (2 * np.pi) - np.pi
-            total += angle**2 + 0.1 * x[:, 1] ** 2
-            x = np.stack([self._task_step(each) for each in x])
-            path.append(x)
+            task, still = self._task, np.zeros((n, 1))
+            total += task.control_dt * task.cost(x, still, np.zeros(0))
+            path.append(named_robot(task.ROBOT).step(x, still, task.control_dt))
             taken.append(np.zeros(n))
             lengths += 1
         else:
             total[ended == 0] = np.inf
         moved, applied = np.stack(path, axis=1), np.stack(taken, axis=1)[..., None]
         return [(moved[i, : k + 1], applied[i, :k]) for i, k in enumerate(lengths)], total
-
-    def _task_step(self, x: np.ndarray) -> np.ndarray:
-        return np.array(named_robot(self._task.ROBOT).step(x, np.zeros(1), self._task.control_dt))
 
     def _followed(
         self, table: np.ndarray, states: np.ndarray, ended: np.ndarray
@@ -180,7 +176,7 @@ def summary(name: str, lines: list[dict[str, float]]) -> str:
     return f"| {name} | {len(lines)} | {' | '.join(cells)} | {inside} | {' | '.join(lower)} |"
 
 
-def picture(shown: dict[str, tuple[Grid, np.ndarray]], policy: Path | None, path: Path) -> None:
+def draw(shown: dict[str, tuple[Grid, np.ndarray]], policy: Path | None, path: Path) -> None:
     """The values over the states, with optimal paths over them, and those of a policy."""
     figure, panels = plt.subplots(1, len(shown), figsize=(6 * len(shown), 4.5), squeeze=False, layout="constrained")
     for panel, (name, (grid, table)) in zip(panels[0], shown.items(), strict=True):
@@ -227,31 +223,41 @@ def _driven(policy: Path, id: str, seed: int) -> np.ndarray:
     return np.array(states)
 
 
-def main() -> None:
-    """Compares, writes a file for each task and the picture, and prints the summary."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", default=list(SYSTEMS), choices=list(SYSTEMS))
-    parser.add_argument("--episodes", type=int, default=200)
-    parser.add_argument("--finer", type=float, default=1.0, help="how many times finer than usual the grids are")
-    parser.add_argument("--out", type=Path, default=Path("runs/exhaustive"))
-    parser.add_argument("--picture", type=Path)
-    parser.add_argument("--policy", type=Path, help="a model of Stable-Baselines3's PPO, trained in Pendulum-v1")
-    chosen = parser.parse_args()
+def main(
+    tasks: tuple[str, ...] = tuple(SYSTEMS),
+    episodes: int = 200,
+    finer: float = 1.0,
+    out: Path = Path("runs/exhaustive"),
+    picture: Path | None = None,
+    policy: Path | None = None,
+) -> None:
+    """Compares, writes a file for each task and the picture, and prints the summary.
+
+    Args:
+        tasks: pendulum, mountain_car or both.
+        episodes: number of certified episodes, from the first.
+        finer: how many times finer than usual the grids are.
+        out: folder of a table for each task.
+        picture: file of the picture; default, none.
+        policy: a model of Stable-Baselines3's PPO that was trained in Pendulum-v1, whose paths the picture shows too.
+    """
+    if unknown := set(tasks) - set(SYSTEMS):
+        raise SystemExit(f"unknown tasks {', '.join(sorted(unknown))}; known: {', '.join(SYSTEMS)}")
     ballbot_classic.register()
     rows, shown = [], {}
-    for name in chosen.tasks:
-        lines, grid, table = compared(name, chosen.finer, chosen.episodes)
+    for name in tasks:
+        lines, grid, table = compared(name, finer, episodes)
         shown[name] = grid, table
-        files.write_csv(chosen.out / f"classic-exhaustive-{name.replace('_', '-')}.csv", lines)
+        files.write_csv(out / f"classic-exhaustive-{name.replace('_', '-')}.csv", lines)
         rows.append(summary(name, lines))
     print(
         "| task | episodes | optimum against the grid: median, most | the same, half the spacing | within 0.1 % | "
         "optimum above the motion that follows the grid, at most | the same, improved |\n|---|---|---|---|---|---|---|"
     )
     print("\n".join(rows))
-    if chosen.picture:
-        picture(shown, chosen.policy, chosen.picture)
+    if picture:
+        draw(shown, policy, picture)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -57,24 +57,24 @@ class OptimumController(TrajoptController):
         except certified.CertificateError:
             return super()._planned(t, x, c)
         same = (known.states == x).all(1) & (known.constants == c).all(1) & np.isfinite(known.costs) & (t == 0)
-        for i in np.flatnonzero(same[: len(known.trajectories)]):
-            motion, status = known.trajectories[i], str(known.statuses[i])
-            if not np.allclose(
-                motion.x[0], x, rtol=0, atol=1e-12
-            ):  # a set of the cache has the trajectories of some episodes alone
-                continue
-            return Optimum(
-                cost=float(known.costs[i]),
-                trajectory=motion,
-                status="optimal",
-                solver_status=status,
-                violation=float(known.violations[i]),
-                iterations=0,
-                solver=status.partition(":")[0],
-                seconds=0.0,
-                slopes=np.full_like(motion.x, np.nan),
-            )
-        return super()._planned(t, x, c)
+        found = np.flatnonzero(
+            same[: len(known.trajectories)]
+        )  # a set may have the motions of its first episodes alone
+        if not len(found):
+            return super()._planned(t, x, c)
+        i = found[0]
+        status = str(known.statuses[i])
+        return Optimum(
+            cost=float(known.costs[i]),
+            trajectory=known.trajectories[i],
+            status="optimal",
+            solver_status=status,
+            violation=float(known.violations[i]),
+            iterations=0,
+            solver=status.partition(":")[0],
+            seconds=0.0,
+            slopes=np.full_like(known.trajectories[i].x, np.nan),
+        )
 
 
 def cautious_trajopt(task: Task, params: Robot) -> TrajoptController:

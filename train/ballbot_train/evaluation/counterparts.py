@@ -36,7 +36,7 @@ class RegretWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     | regret | cost / cost of the optimum − 1, as everywhere in this package, where return + cost is `Task.survival_pay` |
 
     The optima of starts that are not in the certified set are computed at the end of the episode, which takes from
-    milliseconds to a second, and are kept in the user's cache. Where no optimum is found, the values are NaN.
+    milliseconds to a few seconds, and are kept in the user's cache. Where no optimum is found, the values are NaN.
     """
 
     def __init__(self, env: gymnasium.Env, task: str | Task | None = None):

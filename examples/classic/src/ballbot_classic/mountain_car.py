@@ -110,9 +110,6 @@ class MountainCarUp(Task):
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
         return ops.between(z[0], -0.6, -0.4), 0.0 * z[0]
 
-    def episode_seed(self, index: int) -> tuple[int, ...]:
-        return (index,)
-
     def counterpart_state(self, env: Any) -> tuple[np.ndarray, np.ndarray]:
         return np.array(env.state, np.float64), np.zeros(0)
 

@@ -102,9 +102,6 @@ class PendulumUp(Task):
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: Any) -> tuple[Any, ...]:
         return ops.between(z[0], -math.pi, math.pi), ops.between(z[1], -self.start_rate, self.start_rate)
 
-    def episode_seed(self, index: int) -> tuple[int, ...]:
-        return (index,)
-
     def counterpart_state(self, env: Any) -> tuple[np.ndarray, np.ndarray]:
         return np.array(env.state, np.float64), np.zeros(0)
 
