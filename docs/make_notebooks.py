@@ -1,6 +1,5 @@
 """`make notebooks`: runs the notebooks of docs/notebooks, or some by their names, and keeps their outputs for the site."""
 
-import re
 import sys
 from pathlib import Path
 
@@ -11,16 +10,6 @@ from ballbot_gym import files
 
 NOTEBOOKS = Path(__file__).parent / "notebooks"
 _LIMIT = 1800  # s for a cell, on a busy machine
-_BAR = re.compile(r"\x1b\[\?25l.*?\x1b\[\?25h(?:\r?\x1b\[1A\x1b\[2K)?", re.DOTALL)  # the cursor is hidden until it ends
-
-
-def without_bars(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
-    """The outputs of a cell without progress bars, whose lines a terminal would overwrite."""
-    text = "".join(output["text"] for output in outputs if output["output_type"] == "stream")
-    if not _BAR.search(text):
-        return outputs
-    shown = nbformat.v4.new_output("stream", name="stdout", text=_BAR.sub("", text))
-    return [shown, *(output for output in outputs if output["output_type"] != "stream")]
 
 
 def run(path: Path, folder: Path) -> nbformat.NotebookNode:
@@ -32,7 +21,6 @@ def run(path: Path, folder: Path) -> nbformat.NotebookNode:
     for cell in notebook.cells:
         if cell.cell_type == "code":  # what is written to the terminal says nothing of the notebook
             cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
-            cell.outputs = without_bars(cell.outputs)
     return notebook
 
 

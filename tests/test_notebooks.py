@@ -54,17 +54,24 @@ def test_the_site_shows_a_notebook_with_its_outputs(docs, tmp_path):
     ]
 
 
-def test_notebooks_keep_what_is_printed_between_progress_bars(docs):
+def test_a_notebook_shows_progress_as_lines_without_control_characters(docs, tmp_path):
     import make_notebooks
 
-    bar = "\x1b[?25l\r  episodes 1/2\n\r\x1b[2K  episodes 2/2\n\x1b[?25h\r\x1b[1A\x1b[2K"
-    figure = nbformat.v4.new_output("display_data", {"image/png": "aGk=\n"})
-    outputs = [
-        nbformat.v4.new_output("stream", name="stdout", text=text) for text in (bar, "row 1\n" + bar + "row 2\n")
-    ]
-    shown = make_notebooks.without_bars([*outputs, figure])
-    assert [output.get("text") for output in shown] == ["row 1\nrow 2\n", None]
-    assert make_notebooks.without_bars([figure]) == [figure]
+    code = """
+import time
+from ballbot_train.work import console
+
+console.LATE_SECONDS, console.LINE_SECONDS = 0.0, 0.2
+with console.progress_bars({"episodes": 2}, late=True) as advance:
+    advance("episodes", 1)
+    time.sleep(0.5)
+    advance("episodes", 1)
+"""
+    path = tmp_path / "progress.ipynb"
+    nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(code)]), path)
+    (cell,) = make_notebooks.run(path, tmp_path).cells
+    text = "".join(output["text"] for output in cell.outputs)
+    assert set(text.splitlines()) == {"0:00:00 episodes: 1 of 2"}
 
 
 def test_the_site_says_of_every_setting_what_it_is(docs):

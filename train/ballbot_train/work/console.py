@@ -65,9 +65,13 @@ class PlainConsole(Console):
         return super().render_str(printable(text), **options)
 
 
-# A file or pipe has no width of its own: give it one that holds the widest table.
-# Notebooks get lines of text as well: their bars need widgets.
-console = PlainConsole(width=None if sys.stdout.isatty() else 160, force_jupyter=False)
+_IS_NOTEBOOK = Console().is_jupyter
+
+# A file or pipe has no width of its own: give it one that holds the widest table. Notebooks get lines of text as well: bars
+# need widgets there, and FORCE_COLOR, which kernels set, does not make them terminals.
+console = PlainConsole(
+    width=None if sys.stdout.isatty() else 160, force_jupyter=False, force_terminal=False if _IS_NOTEBOOK else None
+)
 
 
 LINE_SECONDS = 10.0
@@ -89,11 +93,17 @@ def _speed(task: Task) -> str:
 
 
 class _LineProgress(Progress):
-    """Progress for a file or a pipe, which cannot show a bar: every now and then a line per bar that is not full."""
+    """Progress for a file, a pipe or a notebook, which cannot show a bar: now and then a line per bar that is not full."""
 
     def start(self) -> None:
         super().start()
         threading.Thread(target=self._print_lines, daemon=True).start()
+
+    def stop(self) -> None:
+        if _IS_NOTEBOOK:
+            self.live.stop()  # alone: the full bar is not shown, and rich would end its line
+        else:
+            super().stop()
 
     def _print_lines(self) -> None:
         while not time.sleep(LINE_SECONDS) and self.live.is_started:
@@ -136,20 +146,21 @@ def progress_bar() -> Progress:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    return (Progress if console.is_terminal else _LineProgress)(*columns, console=console)
+    kind = Progress if console.is_terminal else _LineProgress
+    return kind(*columns, console=console, transient=_IS_NOTEBOOK)  # no full bar below the lines of a notebook
 
 
 @contextmanager
 def progress_bars(totals: Mapping[str, int], late: bool = False) -> Iterator[Callable[[str, int], None]]:
     """Shows a bar for every name while the block runs; the numbers are how many steps each has. Gives what moves one on.
 
-    Late bars show on a terminal alone, when the block has taken `LATE_SECONDS`.
+    Late bars show on terminals and in notebooks alone, when the block has taken `LATE_SECONDS`.
     """
     begin, progress = time.monotonic(), progress_bar()
     bars = {name: progress.add_task(printable(name), total=total) for name, total in totals.items()}
 
     def advance(name: str, count: int) -> None:
-        is_due = late and console.is_terminal and time.monotonic() - begin >= LATE_SECONDS
+        is_due = late and (console.is_terminal or _IS_NOTEBOOK) and time.monotonic() - begin >= LATE_SECONDS
         if is_due and not progress.live.is_started:
             progress.start()
         progress.advance(bars[name], count)
