@@ -353,3 +353,21 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
     must.reset(seed=0)
     with pytest.raises(RuntimeError, match="no such compiler"):
         must.step(torch.zeros(4, 2))
+
+
+@pytest.mark.parametrize("component", [0, 1, 2])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_no_component_of_an_action_in_a_vector_may_be_other_than_finite(bad, component, make_vec):
+    actions = np.array([[0.5, 0.5, 0.5]] * 2)
+    actions[1, component] = bad
+    for kind in (np.float32, np.float64):
+        envs = make_vec(2, robot="omni", dtype=torch.float32)
+        envs.reset(seed=0)
+        with pytest.raises(ValueError, match=r"finite; those of envs \[1\]"):
+            envs.step(actions.astype(kind))
+    batch = BallbotBatch("stabilize", 2, robot="omni", compile=False)
+    batch.reset(seed=0)
+    held = batch.state
+    with pytest.raises(ValueError, match=r"finite; those of envs \[1\]"):
+        batch.step(torch.as_tensor(actions))
+    assert batch.state is held
