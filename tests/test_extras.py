@@ -4,8 +4,11 @@ import re
 import subprocess
 import sys
 from importlib.metadata import metadata
+from pathlib import Path
 
 import pytest
+
+ROOT = Path(__file__).parent.parent
 
 
 def run(code, *blocked):
@@ -55,6 +58,13 @@ for code, library, extra in {MISSING!r}:
 def test_a_command_without_the_library_of_commands_names_its_extra():
     wrote = run("sys.argv = ['ballbot', 'compare']\nfrom ballbot_train.cli import main\nmain()", "tyro")
     assert 'the commands need pip install "ballbot-gym[train]"' in wrote
+
+
+def test_what_make_runs_on_every_python_is_collected_without_torch():
+    names = re.search(r"^APPLY := .*\(addprefix tests/test_,(.*)\)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
+    paths = [str(ROOT / f"tests/test_{name}") for name in names.split()]
+    wrote = run(f"import pytest\nprint('status', int(pytest.main(['--collect-only', '-q', *{paths!r}])))", "torch")
+    assert "status 0" in wrote, wrote[-2000:]
 
 
 EXTRAS = (
