@@ -22,7 +22,7 @@ PLACES = {
 }
 """The files in which the version stands, and how."""
 DATED = r"^date-released: (.*)$"
-SECTION = r"^## \[(.*?)\](?: - (\d{4}-\d{2}-\d{2}))?\n(.*?)(?=^## \[|\Z)"
+SECTION = r"^## \[?([^]\s]+)\]?(?: - (\d{4}-\d{2}-\d{2}))?\n(.*?)(?=^## |\Z)"
 """A section of the changelog: its version, its date, and its text."""
 
 
@@ -45,11 +45,11 @@ def first_section() -> tuple[str, str, str]:
 def problems() -> list[str]:
     """What keeps this version from being published."""
     named, day, notes = first_section()
+    if not re.fullmatch(r"\d+\.\d+\.\d+", named):
+        return [f"the changelog begins with {named}: `python release/version.py set X.Y.Z` names that section"]
     versions = {name: written(name, pattern) for name, pattern in PLACES.items()}
     versions["the installed package"] = installed("ballbot-gym")
     found = [f"{place} says {said}, and the changelog {named}" for place, said in versions.items() if said != named]
-    if not re.fullmatch(r"\d+\.\d+\.\d+", named):
-        found.append(f"the changelog begins with [{named}]; `python release/version.py set X.Y.Z` names the section")
     if day != (cited := written("CITATION.cff", DATED)):
         found.append(f"CITATION.cff says {cited}, and the changelog {day or 'no date'}")
     if len(notes) < 100:
@@ -79,7 +79,7 @@ def name_version(version: str) -> None:
     put("CITATION.cff", DATED, today)
     path = ROOT / "CHANGELOG.md"
     text = re.sub(
-        r"^## \[Unreleased\]$", f"## [{version}] - {today}", text_of("CHANGELOG.md"), count=1, flags=re.MULTILINE
+        r"^## \[?Unreleased\]?$", f"## [{version}] - {today}", text_of("CHANGELOG.md"), count=1, flags=re.MULTILINE
     )
     path.write_text(text, encoding="utf-8")
 
