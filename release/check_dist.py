@@ -21,6 +21,7 @@ import gymnasium, numpy as np
 from gymnasium.utils.env_checker import check_env
 import ballbot_gym
 from ballbot_gym import certified
+from ballbot_gym.machine_code.single import step_code
 from ballbot_train import evaluate
 
 for task in ballbot_gym.TASKS.values():
@@ -33,10 +34,12 @@ for task in ballbot_gym.TASKS.values():
         observations, rewards, *_ = envs.step(actions)
         assert np.isfinite(observations).all() and np.isfinite(rewards).all()
     speed = 10 * 16384 / (time.perf_counter() - begin)
+    code = step_code(env.unwrapped.step_problem, env.unwrapped.params)
     optima = certified.load(task(), ballbot_gym.default_params())
     row = evaluate(lambda observation: np.zeros(2), env.unwrapped.task, episodes=2)
-    print(f"{task.id}: {env.unwrapped.physics}, {type(envs.unwrapped.batch).__name__} {speed:,.0f} steps/s, "
-          f"{len(optima.costs)} optima, {row.episodes} episodes")
+    kinds = f"{type(code).__name__}, {type(envs.unwrapped.batch).__name__}"
+    counts = f"{len(optima.costs)} optima, {row.episodes} episodes"
+    print(f"{task.id}: {env.unwrapped.physics}, {kinds} {speed:,.0f} steps/s, {counts}")
 try:
     evaluate("lqr", episodes=2)
 except ModuleNotFoundError as error:
@@ -103,7 +106,9 @@ def check(distribution: Path, extras: str) -> None:
         assert "measure:" in stranger.run("ballbot", "--help")
         stranger.run("ballbot", "--version")
         if not extras:
-            print(stranger.run("python", "-", code=ALONE), end="")
+            print(said := stranger.run("python", "-", code=ALONE), end="")
+            if distribution.suffix == ".whl" and not distribution.stem.endswith("-any"):  # it brings compiled code
+                assert said.count("StepCode, BallbotNative") == said.count("\n"), "compiled code is missing or unused"
         if extras == "[baselines]":
             print(stranger.run("python", "-", code=ten_lines()), end="")
         if extras == "[train]":

@@ -66,10 +66,12 @@ def recorded() -> Iterator[list[Code]]:
 
 
 def environments(task: str, robot: str) -> None:
-    """Runs a single environment and vector environments, those of the paper's robot in both precisions."""
-    env = BallbotEnv(task, physics="rk4", robot=robot)
-    env.reset(seed=0)
-    env.step(np.zeros(env.params.action_size))
+    """Runs a single environment in every engine, and vector environments, those of the paper's robot in both precisions."""
+    for physics in installed_physics():
+        env = BallbotEnv(task, physics, robot=robot)
+        env.reset(seed=0)
+        env.step(np.zeros(env.params.action_size))
+        env.close()
     for dtype in ("float32", "float64") if robot == PAPER else ("float32",):
         envs = BallbotVectorEnv(2, task, robot=robot, dtype=dtype, engine="native")
         envs.reset(seed=0)

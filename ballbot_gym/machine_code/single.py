@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ballbot_gym.machine_code.libraries import NoMachineCodeError, library, shipped_source
+from ballbot_gym import machine_code
+from ballbot_gym.machine_code.libraries import NoMachineCodeError, shipped_source
 from ballbot_gym.robot import Kind, Randomization, Robot, first_of_kind, named_robot, sensors
 from ballbot_gym.step import Draws, Outcome, Step, StepState, by_engine, closed_form, observation_size, observe, step
 from ballbot_gym.tasks import Task
@@ -222,7 +223,7 @@ def _function(problem: StepProblem, robot: Robot) -> Callable[..., None]:
         from ballbot_gym.machine_code import codegen  # it imports CasADi
 
         source = codegen.single_source(problem)
-    path = library(f"one-{type(problem.task).__name__.lower()}", source, FLAGS)
+    path = machine_code.library(f"one-{type(problem.task).__name__.lower()}", source, FLAGS)
     function = ctypes.PyDLL(str(path)).compute  # it keeps the GIL: it is short
     function.argtypes, function.restype = (ctypes.c_void_p,), None
     _check(problem, function, robot)
