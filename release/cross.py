@@ -33,7 +33,8 @@ ROLLOUT = """
 #include <stdlib.h>
 enum { B = %d };
 int main(void) {
-    static real x[2][STATES * B], c[2][AT_LEAST_1(CONSTANTS) * B], action[ACTIONS * B], told[2 * TOLD * B], seen[SEEN * B];
+    static real x[2][STATES * B], c[2][AT_LEAST_1(CONSTANTS) * B], action[ACTIONS * B];
+    static real reported[2 * REPORTED * B], seen[SEEN * B];
     static double pay[9 * B];
     static uint8_t flags[9 * B];
     static float end_seen[SEEN * B];
@@ -45,10 +46,10 @@ int main(void) {
         for (int i = 0; i < ACTIONS * B; ++i)
             action[i] = (real)0.5 * real_sin((real)(n + 0.1 * i));
         Memory m = {.B = B, .most = 10, .env = 1, .component = B, .x = x[0], .c = c[0], .action = action, .steps = steps,
-                    .episode = episode[0], .seed = seed, .begins = 1, .restarts = 1, .told = told, .seen = seen, .pay = pay,
-                    .flags = flags, .counts = counts, .new_c = c[1], .end_seen = end_seen};
+                    .episode = episode[0], .seed = seed, .begins = 1, .restarts = 1, .reported = reported,
+                    .seen = seen, .pay = pay, .flags = flags, .counts = counts, .new_c = c[1], .end_seen = end_seen};
         step(&m);
-        memcpy(x[0], told, sizeof x[0]);
+        memcpy(x[0], reported, sizeof x[0]);
         memcpy(c[0], c[1], sizeof c[0]);
         memcpy(steps, counts + B, sizeof steps);
         memcpy(episode[0], counts + 2 * B, sizeof steps);
@@ -99,12 +100,12 @@ def states(source: Path, target: str, emulator: tuple[str, ...]) -> np.ndarray:
 
 
 def emulate(folder: Path, scratch: Path) -> None:
-    """Compares motions on ARM with those here; float32 differs by rounding, which an unstable robot multiplies."""
+    """Compares motions of batches on ARM with those here; float32 differs by rounding, which an unstable robot multiplies."""
     emulator = shutil.which("qemu-aarch64")
     if emulator is None:
         print("qemu-aarch64 is not installed: the code for ARM was not run")
         return
-    sources = sorted((folder / "source").glob("*.c"))
+    sources = sorted(path for path in (folder / "source").glob("*.c") if not path.stem.startswith("one-"))
     for source in sources:
         copied = scratch / source.name
         shutil.copy(source, copied)

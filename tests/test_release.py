@@ -1,10 +1,15 @@
-"""The version that is published is the same in all places, and the changelog's first section has its notes."""
+"""The version is the same in all places, the changelog's first section has its notes, and code for ARM can be run."""
 
 import shutil
+import subprocess
 from importlib.metadata import version as installed
 from pathlib import Path
 
 import pytest
+
+from ballbot_gym import machine_code
+from ballbot_gym.machine_code import codegen
+from ballbot_gym.tasks.stabilize import Stabilize
 
 ROOT = Path(__file__).parent.parent
 
@@ -34,3 +39,15 @@ def test_what_is_not_released_gets_the_version_that_is_set(heading, version, tmp
     monkeypatch.setattr(version, "installed", lambda _: "3.1.4")
     assert not version.problems()
     assert version.first_section()[2] == notes
+
+
+def test_the_program_that_runs_in_an_emulator_compiles(params, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "release"))
+    import cross
+
+    if (compiler := machine_code.compiler()) is None:
+        pytest.skip("no C compiler")
+    code = tmp_path / "main.c"
+    code.write_text(codegen.source(Stabilize(), params, True) + cross.ROLLOUT % 37)
+    done = subprocess.run([compiler, "-fsyntax-only", str(code)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
