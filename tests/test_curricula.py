@@ -9,8 +9,9 @@ from resuming import goes_on_as_if_never_stopped
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import default_params
-from ballbot_gym.vector.batch import BallbotBatch
-from ballbot_train.learning import curricula
+from ballbot_gym.seeding import spawned
+from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_train.learning import curricula, model_free
 from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.learners import LEARNERS
 
@@ -51,16 +52,20 @@ def run(made, steps=30):
     return [made.step(torch.zeros(made.num_envs, 2)) for _ in range(steps)]
 
 
-def test_without_a_curriculum_episodes_and_rewards_are_those_of_the_batch(task):
-    shorter = replace(task, duration=0.2)
-    plain = BallbotBatch(shorter, 6, compile=False, params=default_params())
-    plain.reset(0)
-    made = CurriculumBatch(shorter, 6, default_params())
-    made.reset(0)
-    for ours, theirs in zip(run(made, 15), run(plain, 15), strict=True):
-        assert torch.equal(ours.reward, theirs.reward)
-        assert torch.equal(ours.observation, theirs.observation)
-    assert made.difficulty == {}
+def training_envs(task, num_envs, **options):
+    return model_free._TrainingEnv(model_free._make_envs(task, num_envs, default_params()), **options)
+
+
+def test_without_a_curriculum_episodes_and_rewards_are_those_of_the_task(task):
+    made, plain = training_envs(task, 6, reward_scale=0.5), BallbotVectorEnv(6, task, params=default_params())
+    made.seed(0)
+    made.reset()
+    plain.reset(seed=spawned(0))
+    actions = np.zeros((6, 2), np.float32)
+    for _ in range(15):
+        ours, theirs = made.step(actions), plain.step(actions)
+        assert np.array_equal(ours[0], theirs[0])
+        assert np.array_equal(ours[1], np.float32(0.5) * theirs[1].astype(np.float32))
 
 
 def test_a_goal_that_is_twice_as_wide_holds_twice_as_far_out(constants):
@@ -101,7 +106,7 @@ def test_the_goal_narrows_and_then_the_speed_rises_whenever_enough_episodes_succ
 def test_shaping_adds_up_to_the_potential_of_the_start(constants):
     gamma = 0.9
     constants(RAMPS={})  # the same episodes are drawn
-    plain, made = batch(gamma=gamma, pay=False), backwards(gamma=gamma)
+    plain, made = batch(gamma=gamma), backwards(gamma=gamma)
     start = made.state
     steps = made.task.steps
     assert not made.is_settled
@@ -116,7 +121,7 @@ def test_shaping_adds_up_to_the_potential_of_the_start(constants):
 
 @pytest.mark.parametrize("name", ["stabilize", "turn"])
 def test_without_pay_the_reward_is_minus_the_cost_and_a_failure_has_its_price(name):
-    made = batch(name, pay=False)
+    made = batch(name)
     plain = batch(name)
     for ours, theirs in zip(run(made), run(plain), strict=True):
         running = theirs.cost.clone()
@@ -141,20 +146,20 @@ def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones(con
 
 
 def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
-    torch.manual_seed(0)
+    np.random.seed(0)
     task = replace(make_task("stabilize"), duration=2.0)
-    batch = CurriculumBatch(task, 400, default_params(), short_episodes=(0.5, 0.1))
-    batch.reset(seed=0)
-    assert batch.state is not None
-    batch.state = batch.state._replace(steps=torch.full((400,), task.steps - 1))
-    actions = torch.zeros(400, 2)
-    assert batch.step(actions).truncated.all()  # the next episodes begin, some of them short
+    envs = training_envs(task, 400, reward_scale=1.0, short_episodes=(0.5, 0.1))
+    envs.reset()
+    envs._set_steps(np.full(400, task.steps - 1))
+    actions = np.zeros((400, 2), np.float32)
+    assert envs.step(actions)[2].all()  # the next episodes begin, some of them short
     for _ in range(4):
-        assert not batch.step(actions).truncated.any()
-    short = batch.step(actions).truncated
-    assert 0.4 < short.double().mean() < 0.6
+        assert not envs.step(actions)[2].any()
+    short = envs.step(actions)[2]
+    assert 0.4 < short.mean() < 0.6
     for _ in range(10):  # no other than short ones ends before 2 s
-        assert not (batch.step(actions).truncated & ~short).any()
+        *_, done, infos = envs.step(actions)
+        assert not any(infos[i]["TimeLimit.truncated"] for i in np.flatnonzero(done & ~short))
 
 
 def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypatch, constants):
@@ -171,11 +176,16 @@ def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypat
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("stabilize", {"backwards": True}, "BallbotStabilize-v0 cannot be learned backwards"),
+        (
+            "stabilize",
+            {"backwards": True, "relative_advantages": False},
+            "BallbotStabilize-v0 cannot be learned backwards",
+        ),
         ("turn", {"short_episodes": (0.5, 0.6)}, "BallbotTurn-v0 pays at its goal"),
         ("weave", {"short_episodes": (1.5, 0.6)}, "short_episodes must be a share of 0 to 1"),
     ],
 )
 def test_what_a_task_has_not_is_refused(name, settings, message):
+    wanted = replace(LEARNERS["ppo"].settings(name), num_envs=4, **settings)
     with pytest.raises(ValueError, match=message):
-        batch(name, **settings)
+        LEARNERS["ppo"].make(make_task(name), default_params(), wanted, 0)

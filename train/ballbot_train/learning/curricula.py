@@ -1,7 +1,5 @@
 """Training episodes that are easier than the task, or begin in more useful states. Evaluation always uses the task itself.
 
-- `short_episodes`: a share of the episodes is cut soon after its start, so that more of the samples are of starts, where most
-  of a good policy's regret arises.
 - `backwards`: for tasks that end at their goal, which chance does not find.
   - The goal's tolerances begin wider, and narrow by a factor whenever enough episodes succeed. Then a field of the task that
     bounds what is drawn, as Turn's `max_speed`, goes from an easier value to the task's own.
@@ -70,9 +68,7 @@ class CurriculumBatch(BallbotBatch):
         params: Robot,
         gamma: float = 1.0,
         full: Task | None = None,
-        short_episodes: tuple[float, float] = (0.0, 0.6),
         backwards: bool = False,
-        pay: bool = True,
         **world: Any,
     ):
         """Makes the batch.
@@ -83,9 +79,7 @@ class CurriculumBatch(BallbotBatch):
             params: the robot.
             gamma: discount factor of the learner, for shaping.
             full: the task itself, whose optima are found; default, `task`.
-            short_episodes: share of the episodes that is cut, and how long these last, s.
             backwards: whether training goes from the goal backwards.
-            pay: whether living pays; else, and backwards, the reward is minus the running cost, and a failure has a price.
             world: randomization and history, see `BallbotBatch`.
 
         Raises:
@@ -94,13 +88,9 @@ class CurriculumBatch(BallbotBatch):
         distance = task.goal_distance((0.0,) * 8, (1.0,) * len(task.constant_names))
         if backwards and (not task.first_exit or distance is None):
             raise ValueError(f"{task.id} cannot be learned backwards: it needs first_exit and goal_distance")
-        if not (0 <= short_episodes[0] <= 1 and short_episodes[1] > 0):
-            raise ValueError(f"short_episodes must be a share of 0 to 1 and seconds above 0, not {short_episodes}")
-        if short_episodes[0] and task.first_exit:
-            raise ValueError(f"{task.id} pays at its goal for the time that is left, so short_episodes must be 0")
         super().__init__(task, num_envs, compile=False, params=params, **world)
         self.gamma, self.own_task, self._full = gamma, task, task if full is None else full
-        self._short, self.backwards, self._pay = short_episodes, backwards, pay and not backwards
+        self.backwards = backwards
         self._goal_factor = _GOAL_FACTOR if backwards else 1.0
         ramps = {name: start for name, (start, _) in _RAMPS.items() if backwards and hasattr(task, name)}
         self._ramp = {name: min(start, getattr(task, name)) for name, start in ramps.items()}
@@ -146,13 +136,11 @@ class CurriculumBatch(BallbotBatch):
         before, task = self.state, self.task
         result = super().step(actions)
         assert before is not None  # else the step above raises
-        reward = result.reward
-        if not self._pay:
-            survive = task.survival_reward * task.control_dt
-            price = FAILURE_PRICE if self.is_settled else _EARLY_FAILURE_PRICE
-            reward = reward - survive - price * result.failure
-            if task.first_exit:
-                reward = reward - survive * (task.steps - before.steps - 1) * result.success
+        survive = task.survival_reward * task.control_dt
+        price = FAILURE_PRICE if self.is_settled else _EARLY_FAILURE_PRICE
+        reward = result.reward - survive - price * result.failure
+        if task.first_exit:
+            reward = reward - survive * (task.steps - before.steps - 1) * result.success
         if self.backwards:
             start, end = (self._potential(x, before.c) for x in (before.x, result.final_x))
             # An episode that terminates ends with a potential of 0; a truncated one keeps its own.
@@ -161,8 +149,6 @@ class CurriculumBatch(BallbotBatch):
         if self.backwards:
             result = self._go_backwards(result, ended)
         self._begin(ended)
-        if self._short[0]:
-            self._shorten(ended)
         return result._replace(reward=reward)
 
     def curriculum_state(self) -> dict[str, Any]:
@@ -296,14 +282,6 @@ class CurriculumBatch(BallbotBatch):
         states[:, moved], constants[:, moved] = starts[:8].to(states.dtype), starts[8:-1].to(constants.dtype)
         steps[moved] = starts[-1].long()
         self.state = self.state._replace(x=states, c=constants, steps=steps)
-
-    def _shorten(self, ended: torch.Tensor) -> None:
-        """Cuts a share of the episodes that have just begun: their clocks start late, which no observation shows."""
-        assert self.state is not None
-        share, seconds = self._short
-        least = self.task.steps - max(1, round(seconds / self.task.control_dt))
-        short = ended & (torch.rand(self.num_envs) < share)
-        self.state = self.state._replace(steps=torch.where(short, self.state.steps.clamp(min=least), self.state.steps))
 
 
 def _widened(task: Task, factor: float) -> Task:

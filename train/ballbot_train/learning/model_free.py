@@ -17,7 +17,7 @@ from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_gym.vector import BallbotVectorEnv
-from ballbot_gym.vector.batch import BatchState
+from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_train.learning.actors import Symmetry, average_of
 from ballbot_train.learning.critics import cost_to_go
 from ballbot_train.learning.curricula import CurriculumBatch
@@ -107,6 +107,7 @@ class ModelFree(ABC):
         demos: Demos | None,
         warm: bool,
         frame: Frame | None = None,
+        reach: float = REACH,
         control_dt: float | None = None,
         backwards: bool = False,
         **world: Any,
@@ -115,6 +116,7 @@ class ModelFree(ABC):
         demos: to imitate.
         warm: whether training starts from them or from a policy.
         frame: in which the envs show observations and take actions; demos must be of it already.
+        reach: factor of the actions in the frame.
         control_dt: how long each force is held in training, s; default, as in the task.
         backwards: see `CurriculumBatch`.
         world: randomization and history, see `BallbotBatch`.
@@ -128,24 +130,25 @@ class ModelFree(ABC):
         self.iteration, self._settings, self._task, self._warm = 0, config, task, warm
         self._demos = None if demos is None else Samples.of(demos.observations, demos.actions)
         self._trained = task if control_dt is None else replace(task, control_dt=control_dt)
-        self._pay = not (backwards or (warm and task.first_exit))
+        self._backwards, self._pay = backwards, not (backwards or (warm and task.first_exit))
         self._reward_scale = _REWARD_SCALE if self._pay else _COST_SCALE
         self._gamma = self._per_step(config.gamma)
         self._settled: float | None = None  # share of the iterations after which the curriculum was over
         self._clone_iterations = 0 if demos is None else _CLONE_ITERATIONS
         self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
-        batch = CurriculumBatch(
-            replace(self._trained, duration=config.episode_seconds),
-            config.num_envs,
-            params,
-            self._gamma,
-            self._trained,
+        shorter = replace(self._trained, duration=config.episode_seconds)
+        self._curriculum = None
+        if not self._pay:
+            self._curriculum = CurriculumBatch(
+                shorter, config.num_envs, params, self._gamma, self._trained, backwards, **world
+            )
+        self._env = _TrainingEnv(
+            self._curriculum or _make_envs(shorter, config.num_envs, params, **world),
+            self._reward_scale,
+            frame,
+            reach,
             config.short_episodes,
-            backwards,
-            self._pay,
-            **world,
         )
-        self._env = _TrainingEnv(batch, self._reward_scale, frame)
 
     def _set_model(
         self,
@@ -227,7 +230,9 @@ class ModelFree(ABC):
 
     def _take_gamma(self, gamma: float) -> None:
         """Gives the discount factor to all that have a copy of it."""
-        self._model.gamma = self._buffer.gamma = self._env.batch.gamma = gamma
+        self._model.gamma = self._buffer.gamma = gamma
+        if self._curriculum:
+            self._curriculum.gamma = gamma
 
     @property
     def preparation(self) -> int:
@@ -237,7 +242,7 @@ class ModelFree(ABC):
     @property
     def difficulty(self) -> dict[str, float]:
         """How far the curriculum has come."""
-        return self._env.batch.difficulty
+        return self._curriculum.difficulty if self._curriculum else {}
 
     def iterate(self) -> dict[str, float]:
         # Stable-Baselines3 uses the global generators, and others may have used them since the last iteration
@@ -280,7 +285,7 @@ class ModelFree(ABC):
         """Share of their course that the schedules are through. Backwards, they wait until the curriculum is over, because
         learning needs the initial noise until then.
         """
-        if not self._env.batch.backwards:
+        if not self._backwards:
             return self._share_done
         if self._settled is None:
             return min(self._share_done, _WAITING_PROGRESS)
@@ -296,7 +301,7 @@ class ModelFree(ABC):
     def _learning_rate(self) -> float:
         """The learning rate now. Large steps find the way backwards, and small ones then bring costs down."""
         rate, fraction = self._settings.learning_rate, self._settings.final_learning_rate_fraction
-        if self._settled is not None and self._env.batch.backwards:
+        if self._settled is not None and self._backwards:
             settled = _SETTLED_LEARNING_RATE
             return _linear(settled, fraction * rate / settled, self._since_settled)
         return _linear(rate, fraction, self._progress)
@@ -316,7 +321,7 @@ class ModelFree(ABC):
     def _improve(self) -> dict[str, float]:
         """One iteration of reinforcement learning."""
         settings, model = self._settings, self._model
-        if self._settled is None and self._env.batch.is_settled:
+        if self._settled is None and (self._curriculum is None or self._curriculum.is_settled):
             self._settled = self._share_done
         # 1 less the discount factor falls geometrically
         short, shortest = 1 - settings.gamma, 1 - settings.final_gamma
@@ -343,53 +348,94 @@ class ModelFree(ABC):
             (self._imitation_weight * (1 - self._progress) * loss).backward()
 
 
+def _make_envs(task: Task, num_envs: int, params: Robot, **world: Any) -> BallbotVectorEnv:
+    """Envs for learning, in machine code where nothing varies and there is a compiler, and else in torch.
+
+    Args: world: randomization and history, see `BallbotBatch`.
+    """
+    return BallbotVectorEnv(num_envs, task, params=params, compile=False if world else "auto", **world)
+
+
 class _TrainingEnv(BallbotVecEnv):
-    """The envs of a batch for learning, with scaled rewards.
+    """Envs for learning, with scaled rewards.
 
     Their episodes may be shorter than the task's, and the optimal policy stays the same. An episode that runs out of time is
     truncated, and the learners bootstrap from the value of its last state; so shorter episodes only leave out rest, which
-    teaches little.
+    teaches little. A share of them may be cut soon after the start, so that more of the samples are of starts, where most of
+    a good policy's regret arises.
     """
 
-    def __init__(self, batch: CurriculumBatch, reward_scale: float, frame: Frame | None = None):
+    def __init__(
+        self,
+        envs: BallbotVectorEnv | CurriculumBatch,
+        reward_scale: float,
+        frame: Frame | None = None,
+        reach: float = REACH,
+        short_episodes: tuple[float, float] = (0.0, 0.6),
+    ):
         """Takes the envs.
 
         Args:
-            batch: the envs.
+            envs: the envs, or those of a curriculum.
             reward_scale: factor of every reward.
             frame: in which observations are shown and actions taken; default, the task's own.
+            reach: factor of the actions in the frame.
+            short_episodes: share of the episodes that is cut, and how long these last, s.
+
+        Raises:
+            ValueError: short episodes of a task that pays at its goal for the time that is left.
         """
-        world: dict[str, Any] = {"randomization": batch.randomization, "history": batch.history}
-        vector = BallbotVectorEnv(
-            batch.num_envs, batch.own_task, params=batch.params, compile=False, engine="torch", **world
-        )
-        vector.batch = self.batch = batch
-        super().__init__(vector)
+        if isinstance(envs, CurriculumBatch):
+            batch, world = envs, {"randomization": envs.randomization, "history": envs.history}
+            envs = BallbotVectorEnv(
+                batch.num_envs, batch.own_task, params=batch.params, compile=False, engine="torch", **world
+            )
+            envs.batch = batch
+        super().__init__(envs)
+        self.batch: Any = envs.batch
+        self._in_torch = isinstance(self.batch, BallbotBatch)
+        share, seconds = short_episodes
+        if not (0 <= share <= 1 and seconds > 0):
+            raise ValueError(f"short_episodes must be a share of 0 to 1 and seconds above 0, not {short_episodes}")
+        if share and envs.task.first_exit:
+            raise ValueError(
+                f"{envs.task.id} pays at its goal for the time that is left, so the share of short_episodes must be 0"
+            )
+        self._short_share = share
+        self._short_steps = envs.task.steps - max(1, round(seconds / envs.task.control_dt))
         self._scale = np.float32(reward_scale)
         self.bootstrap: Bootstrap | None = None
         """If set, `step_wait` adds what it returns, and SB3 does not call the critic once for each episode."""
-        self._frame, self._axes = frame, np.zeros(0)
+        self._frame, self._reach, self._axes = frame, reach, np.zeros(0)
         if frame is not None:
             self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with step counts that differ so that the episodes never end together."""
-        observation, batch = super().reset(), self.batch
-        assert batch.state is not None
-        steps = torch.arange(self.num_envs) * self.env.task.steps // self.num_envs
-        batch.state = batch.state._replace(steps=steps)
+        observation = super().reset()
+        self._set_steps(np.arange(self.num_envs) * self.env.task.steps // self.num_envs)
         return self._seen(observation)
 
+    def _set_steps(self, steps: np.ndarray) -> None:
+        """Sets the clocks (num_envs,) of the episodes, which no observation shows."""
+        batch = self.batch
+        batch.state = batch.state._replace(steps=torch.from_numpy(steps) if self._in_torch else steps)
+
     def step_async(self, actions: np.ndarray) -> None:
-        super().step_async(actions if self._frame is None else _to_world(self._axes, actions))
+        super().step_async(actions if self._frame is None else _to_world(self._axes, self._reach * actions))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observation, reward, done, infos = super().step_wait()
         reward = self._scale * reward
-        if self._frame is not None:
-            for i in np.flatnonzero(done).tolist():
-                last, _ = _seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
-                infos[i]["terminal_observation"] = last[0]
+        if self._short_share:
+            short = done & (np.random.random(self.num_envs) < self._short_share)
+            steps = np.asarray(self.batch.state.steps)
+            self._set_steps(np.where(short, np.maximum(steps, self._short_steps), steps))
+        ended = np.flatnonzero(done).tolist()
+        if self._frame is not None and ended:
+            last, _ = _seen_in(self._frame, np.stack([infos[i]["terminal_observation"] for i in ended]))
+            for i, seen in zip(ended, last, strict=True):
+                infos[i]["terminal_observation"] = seen
         if self.bootstrap is not None:
             self._add_last_values(self.bootstrap, reward, infos)
         return self._seen(observation), reward, done, infos
@@ -405,14 +451,19 @@ class _TrainingEnv(BallbotVecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """State of every env: tensors and plain values."""
-        assert self.batch.state is not None
-        return {"batch": self.batch.state._asdict(), "curriculum": self.batch.curriculum_state()}
+        state = {name: torch.as_tensor(part) for name, part in self.batch.state._asdict().items()}
+        curriculum = self.batch.curriculum_state() if isinstance(self.batch, CurriculumBatch) else {}
+        return {"batch": state, "curriculum": curriculum}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
-        self.batch.state = BatchState(**state["batch"])
-        self.batch.load_curriculum_state(state["curriculum"])
-        self._seen(self.batch.observe(self.batch.state).numpy())
+        parts: Any = state["batch"]
+        if not self._in_torch:
+            parts = {name: part.numpy() for name, part in parts.items()}
+        self.batch.state = BatchState(**parts)
+        if isinstance(self.batch, CurriculumBatch):
+            self.batch.load_curriculum_state(state["curriculum"])
+        self._seen(np.asarray(self.batch.observe(self.batch.state)))
 
     def _seen(self, observation: np.ndarray) -> np.ndarray:
         """What the learner sees of observations (num_envs, no); notes where the frame's axes are."""
@@ -444,12 +495,12 @@ def _seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.nda
     return _columns(features), np.stack([_columns(back(unit)) for unit in ((one, zero), (zero, one))], -1)
 
 
-def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
-    """Demonstrations with features instead of observations, and with actions in the frame."""
+def demos_in_frame(demos: Demos, frame: Frame, reach: float = REACH) -> Demos:
+    """Demonstrations with features instead of observations, and with actions in the frame, divided by `reach`."""
     observations, axes = _seen_in(frame, demos.observations)
     next_observations, _ = _seen_in(frame, demos.next_observations)
     turned = {
-        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(REACH)
+        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(reach)
         for name in ("actions", "executed")
     }
     return replace(demos, observations=observations, next_observations=next_observations, **turned)
@@ -460,9 +511,9 @@ def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
 
 
 def _to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Actions (n, 2) in [-1, 1] of the frame whose directions are the columns of axes (n, 2, 2), as actions of the world.
+    """Actions (n, 2) in the frame whose directions are the columns of axes (n, 2, 2), as actions of the world.
 
-    Times `REACH` and turned they include all of the world's, and the others are clipped, as `PolicyNetwork` does with the
-    squash "tanh_in_frame". So a small error of an action is small in both.
+    Actions of the frame in ±`REACH` include all of the world's, and the others are clipped, as `PolicyNetwork` does. So a
+    small error of an action is small in both.
     """
-    return np.clip(REACH * np.einsum("nij,nj->ni", axes, actions), -1.0, 1.0)
+    return np.clip(np.einsum("nij,nj->ni", axes, actions), -1.0, 1.0)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import PPO
@@ -22,7 +23,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, cost_to_go
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, demos_in_frame
 from ballbot_train.learning.settings import number
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyNetwork
@@ -148,9 +149,21 @@ class _RelativeRollouts(RolloutBuffer):
         self.advantages = ((relative - relative.mean()) / (relative.std() + 1e-8)).numpy()
 
 
-def _mean(network: PolicyNetwork, observation: torch.Tensor) -> torch.Tensor:
+_WIDE = 100.0
+"""Bound of actions in a frame. SB3 needs one; in the world they are clipped to ±1."""
+
+
+def _acts_in_frame(spec: PolicySpec) -> bool:
+    """Whether the envs can show the features of the frame once, in place of the actor computing them in every epoch."""
+    frame = spec.seen_in
+    return frame is not None and frame.route is None and spec.squash == "clip" and not spec.history
+
+
+def _mean(network: PolicyNetwork, seen: torch.Tensor) -> torch.Tensor:
     """The mean of the actions: before the policy's output is clipped, so that the gradient does not end there."""
-    return network(observation) if network.spec.squash == "tanh" else network.raw(observation)
+    if _acts_in_frame(network.spec):
+        return network.in_frame(seen)
+    return network(seen) if network.spec.squash == "tanh" else network.raw(seen)
 
 
 class _Branches(MlpExtractor):
@@ -163,7 +176,8 @@ class _Branches(MlpExtractor):
         torch.nn.Module.__init__(self)
         self.actor = PolicyNetwork(spec)
         seen, past = self.actor.present, spec.seen - spec.observations
-        self.critic = QuadraticCritic(seen, spec.hidden, torch.nn.Tanh, past, self.actor.shown)
+        shown = {} if _acts_in_frame(spec) else {"shown": self.actor.shown}
+        self.critic = QuadraticCritic(seen, spec.hidden, torch.nn.Tanh, past, **shown)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         return _mean(self.actor, features)
@@ -230,7 +244,12 @@ class _Ppo(ModelFree):
             start = started(start, spec)
             spec = start.spec
         given = None if demos is None else load_demos(demos, task, spec.robot)
-        super().__init__(task, params, config, given, warm, backwards=config.backwards, **world)
+        frame = spec.seen_in if _acts_in_frame(spec) else None
+        if given is not None and frame is not None:
+            given = demos_in_frame(given, frame, 1.0)
+        super().__init__(task, params, config, given, warm, frame, 1.0, backwards=config.backwards, **world)
+        if frame is not None:
+            self._env.action_space = gymnasium.spaces.Box(-_WIDE, _WIDE, (spec.actions,), np.float32)
         self.config = config
         model = PPO(
             _BranchedPolicy,

@@ -262,7 +262,7 @@ class _Sac(ModelFree):
         if given is not None and frame is not None:
             given = demos_in_frame(given, frame)
         warm = demos is not None or start is not None
-        super().__init__(task, params, config, given, warm, frame, None if warm else _CONTROL_DT)
+        super().__init__(task, params, config, given, warm, frame, control_dt=None if warm else _CONTROL_DT)
         self.config, self._imitation_weight = config, _IMITATION_WEIGHT
         network = PolicyNetwork(spec)
         model = SAC(

@@ -113,9 +113,7 @@ class PolicyNetwork(torch.nn.Module):
             plain = observation.ndim == 1 and torch.is_inference_mode_enabled()
             features, back = self.features(self._seen(observation, plain))
             features = (*features, *(estimates.tolist() if plain else estimates.unbind(-1)))
-            action = self.centred(self._sum(_stacked(features, observation)), features)
-            if self.spec.squash == "tanh_in_frame":
-                action = REACH * torch.tanh(action)
+            action = self.in_frame(_stacked(features, observation), features)
             return _stacked(back(tuple(action.tolist()) if plain else action.unbind(-1)), observation)
         if self.spec.informed:
             observation = torch.cat([observation, estimates], -1)
@@ -123,6 +121,11 @@ class PolicyNetwork(torch.nn.Module):
         for signs, action_signs in self._mirrors:
             total = total + action_signs * self._sum(signs * observation)
         return total / (1 + len(self._mirrors)) if self._mirrors else total
+
+    def in_frame(self, inputs: torch.Tensor, features: tuple[Any, ...] | None = None) -> torch.Tensor:
+        """(..., 2) in the frame, as `raw` in the world, for features (..., n) of the frame, also one by one."""
+        action = self.centred(self._sum(inputs), inputs.unbind(-1) if features is None else features)
+        return REACH * torch.tanh(action) if self.spec.squash == "tanh_in_frame" else action
 
     def _seen(self, observation: torch.Tensor, plain: bool = False) -> tuple[Any, ...]:
         """The numbers of an observation, and behind them the sides of routes, if any."""
