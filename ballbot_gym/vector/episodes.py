@@ -1,11 +1,12 @@
-"""Episodes of a policy in a `BallbotBatch`: one of each environment, all at once."""
+"""Episodes of a policy in a `BallbotBatch` or a `BallbotNative`: one of each environment, all at once."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ballbot_gym.lazy import imports_of
+from ballbot_gym.vector.native import BallbotNative
 
 with imports_of(__name__):
     import torch
@@ -32,7 +33,7 @@ class BatchEpisodes(NamedTuple):
 
 @torch.no_grad()
 def run_episodes(
-    batch: BallbotBatch,
+    batch: BallbotBatch | BallbotNative,
     policy: Callable[[torch.Tensor], torch.Tensor],
     x: np.ndarray | torch.Tensor,
     c: np.ndarray | torch.Tensor,
@@ -41,35 +42,85 @@ def run_episodes(
     """Runs one episode of each environment, all at once and without gradients, until the last one has ended.
 
     Args:
-        batch: where to run; it is reset with seed 0.
+        batch: where to run; it is reset with seed 0. A `BallbotNative` is on the CPU, and nothing is drawn there.
         policy: from observations (B, no) to actions (B, 2).
         x: (B, 8) initial states.
         c: (B, nc) constants of the episodes.
         drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
-    given = (
-        None if part is None else torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device)
-        for part in (x, c, drawn)
-    )
-    observation = batch.reset(0, None, *given)
-    running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
+    native = isinstance(batch, BallbotNative)
+    device: Any = "cpu" if native else batch.device
+    observation = (_begun_native if native else _begun)(batch, x, c, drawn)
+    running = torch.ones(batch.num_envs, dtype=torch.bool, device=device)
     success = torch.zeros_like(running)
-    cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
-    steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
+    cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=device)
+    steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=device)
     violated = torch.full_like(steps, -1)
     assert batch.state is not None
-    end, constants = batch.state.x, batch.state.c
+    end, constants = torch.as_tensor(batch.state.x), torch.as_tensor(batch.state.c)
     for _ in range(batch.task.steps):
-        result = batch.step(policy(observation))
+        result = (_stepped_native if native else _stepped)(batch, policy(observation))
         observation = result.observation
         cost += torch.where(running, result.cost, 0.0)
         steps += running
         success |= running & result.success
         violated = torch.where(running & result.failure, result.violated, violated)
-        end = torch.where(running, result.final_x, end)
-        running &= ~(result.terminated | result.truncated)
+        end = torch.where(running, result.x, end)
+        running &= ~result.ended
         if not running.any():
             break
-    c_end = batch.task.at(constants.unbind(0), steps.to(batch.dtype) * batch.task.control_dt)
+    c_end = batch.task.at(constants.unbind(0), steps.to(end.dtype) * batch.task.control_dt)
     goal_error = batch.task.goal_error(end.unbind(0), c_end)
     return BatchEpisodes(cost, success, violated >= 0, violated, steps, goal_error)
+
+
+class _Stepped(NamedTuple):
+    """What a step did in B environments, before those that ended began anew."""
+
+    observation: torch.Tensor
+    """(B, no), of the next episode where one ended."""
+    x: torch.Tensor
+    """(n, B)."""
+    cost: torch.Tensor
+    """(B,)."""
+    success: torch.Tensor
+    """(B,) bool."""
+    failure: torch.Tensor
+    """(B,) bool."""
+    violated: torch.Tensor
+    """(B,) int64."""
+    ended: torch.Tensor
+    """(B,) bool."""
+
+
+def _begun(batch: BallbotBatch, *given: np.ndarray | torch.Tensor | None) -> torch.Tensor:
+    """Observations (B, no) of given starts (B, 8), constants (B, nc) and draws."""
+    kind: Any = {"dtype": batch.dtype, "device": batch.device}
+    return batch.reset(0, None, *(None if part is None else torch.as_tensor(part.T, **kind) for part in given))
+
+
+def _stepped(batch: BallbotBatch, actions: torch.Tensor) -> _Stepped:
+    did = batch.step(actions)
+    ended = did.terminated | did.truncated
+    return _Stepped(did.observation, did.final_x, did.cost, did.success, did.failure, did.violated, ended)
+
+
+def _begun_native(batch: BallbotNative, x: Any, c: Any, drawn: Any) -> torch.Tensor:
+    if drawn is not None:
+        raise ValueError("nothing is drawn in machine code; make a BallbotBatch")
+    starts, constants = (np.asarray(part, batch.dtype).T for part in (x, c))
+    batch.state = batch.initial_state(0, c=constants)._replace(x=starts)
+    return torch.from_numpy(batch.observe(batch.state))
+
+
+def _stepped_native(batch: BallbotNative, actions: torch.Tensor) -> _Stepped:
+    observation, _, terminated, truncated, infos = batch.step(actions.numpy().astype(batch.dtype))
+    ended, names = terminated | truncated, ("state", "cost", "success", "failure", "violated")
+    did = [infos[name] for name in names]
+    if "final_info" in infos:
+        ends = (infos["final_info"][name] for name in names)
+        did = [
+            np.where(ended.reshape(-1, *[1] * (now.ndim - 1)), then, now) for then, now in zip(ends, did, strict=True)
+        ]
+    x, *rest = (torch.from_numpy(np.array(part)) for part in did)
+    return _Stepped(torch.from_numpy(observation), x.T, *rest, torch.from_numpy(ended))

@@ -27,6 +27,7 @@ from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named
 from ballbot_gym.rollout import ActionController, Controller, PlanError
 from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import Task
+from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
 from ballbot_train.evaluation.controllers import as_controller, is_expert, make_controller
@@ -286,7 +287,10 @@ def run_policy(
     """
     policy = _acting(policy, task, robot)
     world: dict[str, Any] = {"randomization": randomization, "history": getattr(policy, "history", 0)}
-    batch = BallbotBatch(task, len(x), compile=False, dtype=dtype, robot=robot, **world)
+    acts = isinstance(policy, ActionController) or callable(policy)
+    own = acts and not world["history"] and randomization == Randomization()
+    compiled: Any = "auto" if own else False
+    batch = BallbotVectorEnv(len(x), task, compile=compiled, dtype=dtype, robot=robot, **world).batch
     return run_episodes(batch, _act(policy, batch), x, c, drawn=drawn if drawn.shape[1] else None)
 
 
