@@ -1,5 +1,6 @@
 import logging
 import math
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -12,12 +13,14 @@ pytest.importorskip("torch")
 import torch
 
 from ballbot_gym import seeding
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector import batch as batch_module
 from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_gym.vector.episodes import run_episodes
+from ballbot_gym.vector.native import BallbotNative
 
 INFO = (
     *("state", "cost", "reward_survive", "reward_cost", "reward_goal", "tilt", "success", "is_success", "failure"),
@@ -60,6 +63,24 @@ def test_episodes_of_a_policy_carry_no_gradient():
     assert not run.cost.requires_grad
     assert run.success.all()
     assert run.steps.tolist() == [5, 5]
+
+
+def test_episodes_of_a_policy_in_machine_code_are_those_in_torch(task, rng):
+    """Some end at the goal or at a limit; then the robot begins again, and what it does does not count any more."""
+    task = replace(task, duration=0.6)
+    params = default_params()
+    starts = [task.sample(np.random.default_rng(seed), params) for seed in range(8)]
+    x, c = (np.array(part, float).reshape(8, -1) for part in zip(*starts, strict=True))
+    weights = torch.from_numpy(rng.normal(size=(task.observation_size(params), 2)).astype(np.float32))
+    runs = [
+        run_episodes(batch, lambda seen: (3 * seen.float() @ weights).clamp(-1, 1), x, c)
+        for batch in (
+            BallbotBatch(task, 8, compile=False, dtype=torch.float64),
+            BallbotNative(task, 8, np.float64, params),
+        )
+    ]
+    for name, ours, theirs in zip(runs[0]._fields, *runs, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task, make_vec, make_env, rng):

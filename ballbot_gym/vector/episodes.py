@@ -48,9 +48,8 @@ def run_episodes(
         c: (B, nc) constants of the episodes.
         drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
-    native = isinstance(batch, BallbotNative)
-    device: Any = "cpu" if native else batch.device
-    observation = (_begun_native if native else _begun)(batch, x, c, drawn)
+    device: Any = "cpu" if isinstance(batch, BallbotNative) else batch.device
+    observation = _begun(batch, x, c, drawn)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=device)
     success = torch.zeros_like(running)
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=device)
@@ -59,7 +58,7 @@ def run_episodes(
     assert batch.state is not None
     end, constants = torch.as_tensor(batch.state.x), torch.as_tensor(batch.state.c)
     for _ in range(batch.task.steps):
-        result = (_stepped_native if native else _stepped)(batch, policy(observation))
+        result = _stepped(batch, policy(observation))
         observation = result.observation
         cost += torch.where(running, result.cost, 0.0)
         steps += running
@@ -93,34 +92,30 @@ class _Stepped(NamedTuple):
     """(B,) bool."""
 
 
-def _begun(batch: BallbotBatch, *given: np.ndarray | torch.Tensor | None) -> torch.Tensor:
+def _begun(batch: BallbotBatch | BallbotNative, x: Any, c: Any, drawn: Any) -> torch.Tensor:
     """Observations (B, no) of given starts (B, 8), constants (B, nc) and draws."""
+    if isinstance(batch, BallbotNative):
+        if drawn is not None:
+            raise ValueError("nothing is drawn in machine code; make a BallbotBatch")
+        starts, constants = (np.asarray(part, batch.dtype).T for part in (x, c))
+        batch.state = batch.initial_state(0, c=constants)._replace(x=starts)
+        return torch.from_numpy(batch.observe(batch.state))
     kind: Any = {"dtype": batch.dtype, "device": batch.device}
-    return batch.reset(0, None, *(None if part is None else torch.as_tensor(part.T, **kind) for part in given))
+    return batch.reset(0, None, *(None if part is None else torch.as_tensor(part.T, **kind) for part in (x, c, drawn)))
 
 
-def _stepped(batch: BallbotBatch, actions: torch.Tensor) -> _Stepped:
-    did = batch.step(actions)
-    ended = did.terminated | did.truncated
-    return _Stepped(did.observation, did.final_x, did.cost, did.success, did.failure, did.violated, ended)
-
-
-def _begun_native(batch: BallbotNative, x: Any, c: Any, drawn: Any) -> torch.Tensor:
-    if drawn is not None:
-        raise ValueError("nothing is drawn in machine code; make a BallbotBatch")
-    starts, constants = (np.asarray(part, batch.dtype).T for part in (x, c))
-    batch.state = batch.initial_state(0, c=constants)._replace(x=starts)
-    return torch.from_numpy(batch.observe(batch.state))
-
-
-def _stepped_native(batch: BallbotNative, actions: torch.Tensor) -> _Stepped:
+def _stepped(batch: BallbotBatch | BallbotNative, actions: torch.Tensor) -> _Stepped:
+    if isinstance(batch, BallbotBatch):
+        did = batch.step(actions)
+        ended = did.terminated | did.truncated
+        return _Stepped(did.observation, did.final_x, did.cost, did.success, did.failure, did.violated, ended)
     observation, _, terminated, truncated, infos = batch.step(actions.numpy().astype(batch.dtype))
-    ended, names = terminated | truncated, ("state", "cost", "success", "failure", "violated")
-    did = [infos[name] for name in names]
-    if "final_info" in infos:
-        ends = (infos["final_info"][name] for name in names)
-        did = [
-            np.where(ended.reshape(-1, *[1] * (now.ndim - 1)), then, now) for then, now in zip(ends, did, strict=True)
-        ]
-    x, *rest = (torch.from_numpy(np.array(part)) for part in did)
-    return _Stepped(torch.from_numpy(observation), x.T, *rest, torch.from_numpy(ended))
+    ended = terminated | truncated
+    # what a step did is in final_info for the episodes that it ended, and else in the info
+    end = infos.get("final_info", infos)
+    did = {
+        name: torch.from_numpy(np.where(ended, end[name].T, infos[name].T))
+        for name in ("cost", "success", "failure", "violated")
+    }
+    x = torch.from_numpy(np.where(ended, end["state"].T, infos["state"].T))
+    return _Stepped(torch.from_numpy(observation), x, **did, ended=torch.from_numpy(ended))

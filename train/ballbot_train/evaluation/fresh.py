@@ -289,8 +289,8 @@ def run_policy(
     world: dict[str, Any] = {"randomization": randomization, "history": getattr(policy, "history", 0)}
     acts = isinstance(policy, ActionController) or callable(policy)
     own = acts and not world["history"] and randomization == Randomization()
-    compiled: Any = "auto" if own else False
-    batch = BallbotVectorEnv(len(x), task, compile=compiled, dtype=dtype, robot=robot, **world).batch
+    compiled = "auto" if own else False
+    batch: Any = BallbotVectorEnv(len(x), task, compile=compiled, dtype=dtype, robot=robot, **world).batch
     return run_episodes(batch, _act(policy, batch), x, c, drawn=drawn if drawn.shape[1] else None)
 
 
