@@ -203,6 +203,8 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     np.testing.assert_array_equal(made.states, known.states[:3])
     np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
     assert len(made.trajectories) == 3
+    certify(("turn",), 3, workers=1, trajectories=2)
+    assert len(certified.load(make_task("turn"), "paper", out / "BallbotTurn-v0.npz").trajectories) == 2
     assert certified.path_of(make_task("turn")).read_bytes() == packaged
 
 

@@ -89,20 +89,37 @@ class EvaluationSet:
         chosen = {name: getattr(self, name)[:episodes] for name in _PER_EPISODE}
         return EvaluationSet(**chosen, trajectories=self.trajectories[:episodes])
 
-    def save(self, task: Task, path: Path, robot: str | Robot, randomization: Randomization = Randomization()) -> Path:
-        """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""
+    def save(
+        self,
+        task: Task,
+        path: Path,
+        robot: str | Robot,
+        randomization: Randomization = Randomization(),
+        trajectories: int | None = None,
+    ) -> Path:
+        """Writes the set, with what defines its optima, so that it is never read for another problem or robot.
+
+        Args:
+            task: whose optima these are.
+            path: of the file.
+            robot: whose optima these are, or its name in `ROBOTS`.
+            randomization: what the robots and actuators of the episodes were drawn from.
+            trajectories: how many of them to write at most, from the first; default, `TRAJECTORIES`, and fewer for tracks and
+                for robots with wheels.
+        """
         params, varied = checked_robot(robot), randomization.moves_optima
         names = _PER_EPISODE if varied else _PER_EPISODE[:-2]
-        trajectories = self.trajectories[:_FEW] if varied or params.LONG_EQUATIONS else self.trajectories
+        few = _FEW if varied or params.LONG_EQUATIONS else TRAJECTORIES
+        moved = self.trajectories[: few if trajectories is None else trajectories]
         arrays = {
             "benchmark": np.array(version.BENCHMARK),
             "task": np.array(task.problem()),
             **({} if params == named_robot(PAPER) else {"robot": np.array(params.record())}),
             **({"randomization": np.array(repr(randomization))} if varied else {}),
             **{name: getattr(self, name) for name in names},
-            "lengths": np.array([len(trajectory.u) for trajectory in trajectories]),
-            "x": np.concatenate([trajectory.x for trajectory in trajectories]),
-            "u": np.concatenate([trajectory.u for trajectory in trajectories]),
+            "lengths": np.array([len(trajectory.u) for trajectory in moved]),
+            "x": np.concatenate([trajectory.x for trajectory in moved]),
+            "u": np.concatenate([trajectory.u for trajectory in moved]),
         }
         return files.write(path, files.npz(arrays))
 
@@ -204,7 +221,7 @@ def from_cache(
         arrays[name] = np.full((rows, *values.shape[1:]), "" if name == "statuses" else np.nan, values.dtype)
         arrays[name][list(needed)] = values
     moved = dict(zip(needed, found.trajectories, strict=True))
-    first = itertools.takewhile(moved.__contains__, range(TRAJECTORIES))
+    first = itertools.takewhile(moved.__contains__, itertools.count())
     return EvaluationSet(**arrays, trajectories=tuple(moved[index] for index in first))
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ballbot_baselines.feedback.nmpc import NmpcController, offset_free_nmpc
     from ballbot_baselines.feedback.trajopt import TrajoptController
     from ballbot_baselines.feedback.tvlqr import TvlqrController
-    from ballbot_baselines.optimum.find import find_optima, find_optimum, plan_to_track
+    from ballbot_baselines.optimum.find import certified_optimum, find_optima, find_optimum, plan_to_track
     from ballbot_baselines.optimum.measured import Regret, regret
     from ballbot_baselines.optimum.optimum import Optimum
     from ballbot_baselines.solvers.guess import along_path
@@ -66,6 +66,7 @@ __all__ = [
     "TrajoptController",
     "TvlqrController",
     "along_path",
+    "certified_optimum",
     "find_optima",
     "find_optimum",
     "offset_free_nmpc",
@@ -79,7 +80,7 @@ _MODULES = {
     "feedback.nmpc": ("NmpcController", "offset_free_nmpc"),
     "feedback.trajopt": ("TrajoptController",),
     "feedback.tvlqr": ("TvlqrController",),
-    "optimum.find": ("find_optima", "find_optimum", "plan_to_track"),
+    "optimum.find": ("certified_optimum", "find_optima", "find_optimum", "plan_to_track"),
     "optimum.measured": ("Regret", "regret"),
     "optimum.optimum": ("Optimum",),
     "solvers.guess": ("along_path",),

@@ -16,7 +16,7 @@ from ballbot_classic import register
 from ballbot_classic.replay import followed
 from minari.data_collector import EpisodeBuffer
 
-from ballbot_baselines import find_optimum
+from ballbot_baselines import certified_optimum, find_optimum
 from ballbot_gym import TASKS, BallbotEnv
 
 
@@ -62,7 +62,8 @@ def main(id: str, /, episodes: int = 200, name: str | None = None) -> minari.Min
     with BallbotEnv(id) as own:
         for seed in range(episodes):
             _, info = own.reset(seed=seed)
-            optima.append(find_optimum(own.task, own.params, info["state"], info["constants"], twice=True))
+            problem = own.task, own.params, info["state"], info["constants"]
+            optima.append(certified_optimum(*problem) or find_optimum(*problem, twice=True))
     dataset = minari.create_dataset_from_buffers(
         name or f"{id.rpartition('-')[0].lower()}/optimum-v0",
         [recorded(env, followed(task, optimum, seed), seed) for seed, optimum in enumerate(optima)],

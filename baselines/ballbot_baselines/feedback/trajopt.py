@@ -3,10 +3,9 @@
 import numpy as np
 
 from ballbot_baselines.feedback.tvlqr import TvlqrController
-from ballbot_baselines.optimum.find import plan_to_track
+from ballbot_baselines.optimum.find import certified_optimum, plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.shooting import Backoff
-from ballbot_gym import certified
 from ballbot_gym.robot import TRACKS, Robot
 from ballbot_gym.tasks import Task
 
@@ -45,36 +44,15 @@ class TrajoptController:
 class OptimumController(TrajoptController):
     """Tracks the optimum itself, without a back-off: the one against which regret is measured.
 
-    It is the certified one where a certified episode starts, and is searched for elsewhere.
+    It is the certified one where that is stored, and is searched for elsewhere.
     """
 
     def __init__(self, task: Task, params: Robot):
         super().__init__(task, params, Backoff())
 
     def _planned(self, t: float, x: np.ndarray, c: np.ndarray) -> Optimum:
-        try:
-            known = certified.load(self._task, self._params)
-        except certified.CertificateError:
-            return super()._planned(t, x, c)
-        same = (known.states == x).all(1) & (known.constants == c).all(1) & np.isfinite(known.costs) & (t == 0)
-        found = np.flatnonzero(
-            same[: len(known.trajectories)]
-        )  # a set may have the motions of its first episodes alone
-        if not len(found):
-            return super()._planned(t, x, c)
-        i = found[0]
-        status = str(known.statuses[i])
-        return Optimum(
-            cost=float(known.costs[i]),
-            trajectory=known.trajectories[i],
-            status="optimal",
-            solver_status=status,
-            violation=float(known.violations[i]),
-            iterations=0,
-            solver=status.partition(":")[0],
-            seconds=0.0,
-            slopes=np.full_like(known.trajectories[i].x, np.nan),
-        )
+        known = certified_optimum(self._task, self._params, x, c) if t == 0 else None
+        return known or super()._planned(t, x, c)
 
 
 def cautious_trajopt(task: Task, params: Robot) -> TrajoptController:

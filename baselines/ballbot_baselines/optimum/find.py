@@ -21,6 +21,7 @@ from ballbot_baselines.optimum.search import attempts
 from ballbot_baselines.solvers.ocp import Solution
 from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_gym import certified
 from ballbot_gym.checks import finite_array
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Robot, checked_robot
@@ -98,6 +99,45 @@ def find_optimum(
         trajectory,
         time.perf_counter() - started,
         slopes=best.slopes,
+        markers=tuple(task.markers(c)),
+        feedback=partial(tube_gains, task, params, trajectory, c),
+    )
+
+
+def certified_optimum(task: str | Task, params: str | Robot, x0: np.ndarray, c: np.ndarray) -> Optimum | None:
+    """The stored optimum of a certified episode, without a search.
+
+    Args:
+        task: the problem, or its name in `TASKS`.
+        params: the robot, or its name in `ROBOTS`.
+        x0: (8,) initial state.
+        c: (nc,) constants of the episode.
+
+    Returns:
+        None where no certified episode starts so, or the set does not have its motion. A set may have the motions of its
+        first episodes alone.
+    """
+    task, params = make_task(task, params), checked_robot(params)
+    try:
+        known = certified.load(task, params)
+    except certified.CertificateError:
+        return None
+    same = (known.states == x0).all(1) & (known.constants == c).all(1) & np.isfinite(known.costs)
+    found = np.flatnonzero(same[: len(known.trajectories)])
+    if not len(found):
+        return None
+    i = found[0]
+    status, trajectory = str(known.statuses[i]), known.trajectories[i]
+    return Optimum(
+        cost=float(known.costs[i]),
+        trajectory=trajectory,
+        status="optimal",
+        solver_status=status,
+        violation=float(known.violations[i]),
+        iterations=0,
+        solver=status.partition(":")[0],
+        seconds=0.0,
+        slopes=np.full_like(trajectory.x, np.nan),
         markers=tuple(task.markers(c)),
         feedback=partial(tube_gains, task, params, trajectory, c),
     )

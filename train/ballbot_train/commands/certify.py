@@ -30,6 +30,7 @@ def certify(
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
     randomization: str | None = None,
+    trajectories: int | None = None,
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
@@ -45,9 +46,11 @@ def certify(
         workers: where the work is done.
         robot: name of the robot; default, the robot that each task names.
         randomization: name of the track that draws the robot and the delay of each episode; default, none.
+        trajectories: optimal motions in each .npz file, those of the first episodes; default, 20, or 5 of tracks and of
+            robots with wheels.
     """
     check_names("task", tasks, TASKS, least=1)
-    check_least(1, episodes=episodes)
+    check_least(1, episodes=episodes, **({} if trajectories is None else {"trajectories": trajectories}))
     if shards is None and episodes > _MOST_EPISODES:
         raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}; or give --shards")
     varied = checked_randomization(randomization)
@@ -71,7 +74,7 @@ def certify(
         found = certified.from_cache(task, params, range(episodes), varied)
         assert found is not None
         name = certified.path_of(task, of, randomization or "").name
-        path = found.first(episodes).save(task, out / name, of, varied)
+        path = found.first(episodes).save(task, out / name, of, varied, trajectories)
         console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failures:
         raise PlanError("\n".join(failures))

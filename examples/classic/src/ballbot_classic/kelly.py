@@ -1,5 +1,6 @@
 """The cart-pole swing-up of Kelly, "An introduction to trajectory optimization" (SIAM Review 2017), section 6."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ class KellySwingUp(Task):
     duration: float = 2.0
     distance: float = 1.0
     track: float = 2.0
-    tolerance: float = 1e-3
+    tolerance: float = 1e-4
 
     id = "KellyCartPole-v0"
     ROBOT = "kelly_cart_pole"
@@ -51,10 +52,18 @@ class KellySwingUp(Task):
         return Reference(np.array([[self.distance, 0.0, 0.0, 0.0]]), np.zeros((1, 1)))
 
     def guesses(self, x: np.ndarray, c: np.ndarray, params: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Straight lines to the end, by either turn of the pole, as Kelly guesses."""
-        share = np.linspace(0, 1, self.steps + 1)[:, None]
-        ends = (np.array([self.distance, upright, 0.0, 0.0]) for upright in (0.0, 2 * math.pi))
-        return [((1 - share) * x + share * end, np.zeros((self.steps, 1))) for end in ends]
+        """To the end by either turn of the pole: straight lines, as Kelly guesses, and a swing back before the pole rises."""
+        share = np.linspace(0, 1, self.steps + 1)
+        found = []
+        for back, turn in itertools.product((0.0, 1.0), (-math.pi, math.pi)):
+            theta = (
+                math.pi
+                + turn * share ** (1 + back)
+                - back * math.copysign(1.0, turn) * np.sin(math.pi * share) * (1 - share)
+            )
+            states = np.stack([self.distance * share, theta, 0 * share, 0 * share], axis=-1)
+            found.append((states, np.zeros((self.steps, 1))))
+        return found
 
 
 register_robot("kelly_cart_pole", CartPole(cart_mass=1.0, pole_mass=0.3, length=0.5, gravity=9.81, force_limit=20.0))

@@ -18,7 +18,7 @@ from ballbot_baselines import Ocp, OcpSolver, Solution
 
 Guesses = list[tuple[np.ndarray, np.ndarray]]
 
-_SOLVED = 3  # guesses, of other numbers of turns
+_SOLVED = 6  # guesses, of other numbers of turns
 _WORSE = 1.03  # times the best solution: where others cost more, better times do not make up for it
 _NEAR_STEPS = 20  # solutions that turn as often and arrive within these steps become the same at their best times
 _BARRIER, _NEAR_BARRIER = 1e-3, 1e-6  # of the first iterate, and near a solution

@@ -3,7 +3,8 @@
 A case says how many turns the pendulum has made at each control step, which the cost of the angle depends on, and at which
 steps the rate is clipped. The angle's cost is the least over all numbers of turns. So a solution of a case costs at least the
 true cost of its motion, and to repeat the search in the case of that motion lowers the cost until they agree. Where a rate
-reaches its limit without being clipped, the search is repeated with this rate clipped.
+reaches its limit without being clipped, the search is repeated with this rate clipped. The best solution is tried again a
+control step earlier and later, as long as that lowers the cost.
 
 In a case the rate is clipped when it is used: the variables are ψ, the angle a control step ago, and r, the rate before it is
 clipped, so that θ = ψ + dt·clipped(r). A rate that is clipped must be beyond its limit, and no other may be.
@@ -43,22 +44,48 @@ def solutions(task: Any, episode: Any, guesses: Guesses | None = None) -> list[S
     for x, u in task.guesses(episode.x0, episode.c, params)[:_SOLVED] if guesses is None else guesses:
         if _cost(task, x, u) > _WORSE * min((solution.cost for solution in found), default=math.inf):
             break
-        least, clipped = math.inf, np.abs(x[1:, 1]) >= params.speed_limit
-        for _ in range(_ROUNDS):
-            turns = np.floor((x[:-1, 0] + math.pi) / _TURN)
-            numbers = _numbers(turns, np.where(clipped, np.sign(x[1:, 1]), 0.0))
-            if numbers is None:
-                break
-            solution = _solved(episode, x, u, numbers)
-            known = any(math.isclose(solution.cost, other.cost, rel_tol=1e-9) for other in found)
-            if not solution.is_optimal or known or solution.cost > least:
-                break
-            x, u, least = solution.states, solution.inputs * params.force_limit, solution.cost
-            found.append(solution)
-            at_limit = np.abs(x[1:, 1]) > params.speed_limit - 1e-4
-            if (at_limit <= clipped).all() and (turns == np.floor((x[:-1, 0] + math.pi) / _TURN)).all():
-                break
-            clipped = clipped | at_limit
+        found += _descended(episode, x, u, found)
+    least = math.inf
+    while found and (best := min(found, key=lambda solution: solution.cost)).cost < least:
+        least = best.cost
+        for steps in (-1, 1):
+            found += _descended(episode, *_shifted(best, steps, params.force_limit), found)
+    return found
+
+
+def _shifted(solution: Solution, steps: int, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """States (n+1, 2) and actions (n, 1) of a solution, later by some control steps, as a guess.
+
+    A torque at its limit switches between control steps, and wherever it does so is a local optimum.
+    """
+    n = len(solution.inputs)
+    at = np.clip(np.arange(n + 1) - steps, 0, n)
+    x = solution.states[at]
+    x[0] = solution.states[0]
+    return x, limit * solution.inputs[np.minimum(at[:-1], n - 1)]
+
+
+def _descended(episode: Any, x: np.ndarray, u: np.ndarray, known: list[Solution]) -> list[Solution]:
+    """Solutions from a motion x (n+1, 2) and u (n, 1), each in the case of the one before and cheaper, until they lead to a
+    known one.
+    """
+    params, found, least = episode.params, list[Solution](), math.inf
+    clipped = np.abs(x[1:, 1]) >= params.speed_limit
+    for _ in range(_ROUNDS):
+        turns = np.floor((x[:-1, 0] + math.pi) / _TURN)
+        numbers = _numbers(turns, np.where(clipped, np.sign(x[1:, 1]), 0.0))
+        if numbers is None:
+            break
+        solution = _solved(episode, x, u, numbers)
+        repeated = any(math.isclose(solution.cost, other.cost, rel_tol=1e-9) for other in known + found)
+        if not solution.is_optimal or repeated or solution.cost > least:
+            break
+        x, u, least = solution.states, solution.inputs * params.force_limit, solution.cost
+        found.append(solution)
+        at_limit = np.abs(x[1:, 1]) > params.speed_limit - 1e-4
+        if (at_limit <= clipped).all() and (turns == np.floor((x[:-1, 0] + math.pi) / _TURN)).all():
+            break
+        clipped = clipped | at_limit
     return found
 
 
