@@ -13,6 +13,7 @@ from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector.batch import BallbotBatch
+from ballbot_gym.vector.native import BallbotNative
 from ballbot_train import BallbotVecEnv
 from ballbot_train.evaluation import fresh, runner
 from ballbot_train.learning import dagger, demonstrations
@@ -35,19 +36,23 @@ SMALL = {
 def starts(monkeypatch):
     """Every initial state that is drawn, as bytes."""
     drawn = set()
-    initial, sample = BallbotBatch.initial_state, Stabilize.sample
+    sample = Stabilize.sample
 
-    def of_batch(self, *arguments, **options):
-        state = initial(self, *arguments, **options)
-        drawn.update(x.numpy().tobytes() for x in state.x.detach().T)
-        return state
+    def watched(initial):
+        def of_batch(self, *arguments, **options):
+            state = initial(self, *arguments, **options)
+            drawn.update(x.tobytes() for x in np.asarray(state.x).T)
+            return state
+
+        return of_batch
 
     def of_task(self, *arguments, **options):
         x, c = sample(self, *arguments, **options)
         drawn.add(x.tobytes())
         return x, c
 
-    monkeypatch.setattr(BallbotBatch, "initial_state", of_batch)
+    for kind in (BallbotBatch, BallbotNative):
+        monkeypatch.setattr(kind, "initial_state", watched(kind.initial_state))
     monkeypatch.setattr(Stabilize, "sample", of_task)
     return drawn
 
