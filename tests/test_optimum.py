@@ -11,6 +11,7 @@ import casadi
 from ballbot_baselines import Backoff, LqrController, find_optimum, plan_to_track
 from ballbot_baselines.optimum import find as optimum_module
 from ballbot_baselines.solvers.ocp import FEASIBLE, Ocp, OcpSolver
+from ballbot_baselines.solvers.shooting import Shooting
 from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.orbit import Orbit
@@ -250,3 +251,12 @@ def test_ctrl_c_within_a_solver_is_not_lost(number, monkeypatch):
         assert signal.getsignal(number) is interrupted
     finally:
         signal.signal(number, before)
+
+
+def test_a_motion_starts_where_the_episode_does_wherever_its_guess_starts(params):
+    task = Stabilize(duration=2.0)
+    x0 = np.array([0.5, 0, 0, 0, 0, 0, 0, 0])
+    episode = Shooting(task, params, x0, np.zeros(0), Backoff())
+    solution = episode.solve(np.zeros((task.steps + 1, 8)), np.zeros((task.steps, 2)))
+    assert solution.is_optimal
+    np.testing.assert_allclose(solution.states[0], x0, atol=1e-9)

@@ -207,7 +207,7 @@ class Shooting:
         tolerance = tolerance or (1e-6 if self.params.grips else 1e-8)
         made = _solver(*kind_of(self.task, self.params), free_time, n, solver, tolerance, iterations, barrier)
         lower, upper = made.ocp.no_bounds(n)
-        lower[0, :known] = upper[0, :known] = x[0, :known]
+        lower[0, :known] = upper[0, :known] = self.x0
         lower[:, x.shape[1] :], upper[:, x.shape[1] :] = force - 1, 1 - force
         if free_time:
             longest = self.task.duration / n
