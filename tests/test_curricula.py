@@ -11,6 +11,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import default_params
 from ballbot_gym.seeding import spawned
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_train.evaluation.fresh import make_envs
 from ballbot_train.learning import curricula, model_free
 from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.learners import LEARNERS
@@ -53,7 +54,7 @@ def run(made, steps=30):
 
 
 def training_envs(task, num_envs, **options):
-    return model_free._TrainingEnv(model_free._make_envs(task, num_envs, default_params()), **options)
+    return model_free._TrainingEnv(make_envs(num_envs, task, True, params=default_params()), **options)
 
 
 def test_without_a_curriculum_episodes_and_rewards_are_those_of_the_task(task):

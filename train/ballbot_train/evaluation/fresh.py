@@ -22,6 +22,7 @@ from ballbot_gym import files
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
+from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.registry import name_of
 from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
 from ballbot_gym.rollout import ActionController, Controller, PlanError
@@ -288,10 +289,27 @@ def run_policy(
     policy = _acting(policy, task, robot)
     world: dict[str, Any] = {"randomization": randomization, "history": getattr(policy, "history", 0)}
     acts = isinstance(policy, ActionController) or callable(policy)
-    own = acts and not world["history"] and randomization == Randomization()
-    compiled = "auto" if own else False
-    batch: Any = BallbotVectorEnv(len(x), task, compile=compiled, dtype=dtype, robot=robot, **world).batch
+    plain = acts and not world["history"] and randomization == Randomization()
+    batch: Any = make_envs(len(x), task, plain, dtype=dtype, robot=robot, **world).batch
     return run_episodes(batch, _act(policy, batch), x, c, drawn=drawn if drawn.shape[1] else None)
+
+
+def make_envs(num_envs: int, task: Task, plain: bool, **settings: Any) -> BallbotVectorEnv:
+    """Envs in machine code where nothing varies and the task's can be made, and else in torch without compiling, which takes
+    longer than most runs.
+
+    Args:
+        num_envs: B.
+        task: the task.
+        plain: whether nothing varies, and no past is seen.
+        settings: other arguments of `BallbotVectorEnv`.
+    """
+    if plain:
+        try:
+            return BallbotVectorEnv(num_envs, task, engine="native", **settings)
+        except (ImportError, NoMachineCodeError):
+            pass
+    return BallbotVectorEnv(num_envs, task, engine="torch", compile=False, **settings)
 
 
 def _acting(policy: Any, task: Task, robot: str) -> Any:

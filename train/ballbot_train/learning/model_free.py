@@ -18,6 +18,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
+from ballbot_train.evaluation.fresh import make_envs
 from ballbot_train.learning.actors import Symmetry, average_of
 from ballbot_train.learning.critics import cost_to_go
 from ballbot_train.learning.curricula import CurriculumBatch
@@ -143,7 +144,7 @@ class ModelFree(ABC):
                 shorter, config.num_envs, params, self._gamma, self._trained, backwards, **world
             )
         self._env = _TrainingEnv(
-            self._curriculum or _make_envs(shorter, config.num_envs, params, **world),
+            self._curriculum or make_envs(config.num_envs, shorter, not world, params=params, **world),
             self._reward_scale,
             frame,
             reach,
@@ -346,14 +347,6 @@ class ModelFree(ABC):
             actions = self._act(self._demos.observations[drawn])
             loss = nn.functional.mse_loss(actions, self._demos.actions[drawn])
             (self._imitation_weight * (1 - self._progress) * loss).backward()
-
-
-def _make_envs(task: Task, num_envs: int, params: Robot, **world: Any) -> BallbotVectorEnv:
-    """Envs for learning, in machine code where nothing varies and there is a compiler, and else in torch.
-
-    Args: world: randomization and history, see `BallbotBatch`.
-    """
-    return BallbotVectorEnv(num_envs, task, params=params, compile=False if world else "auto", **world)
 
 
 class _TrainingEnv(BallbotVecEnv):
