@@ -50,6 +50,14 @@ def test_fresh_episodes_are_neither_certified_nor_for_validation_nor_of_another_
     assert len(np.unique(starts, axis=0)) == 3 * count + len(episodes)
 
 
+def test_processes_find_what_one_does(monkeypatch):
+    monkeypatch.setattr(fresh, "_BATCH", 20)
+    one, two = (evaluate_fresh("dagger", "turn", 50, workers=workers) for workers in (1, 2))
+    assert np.array_equal(one.costs, two.costs)
+    assert np.array_equal(one.states, two.states)
+    assert all(np.array_equal(one.measures[name], two.measures[name]) for name in one.measures)
+
+
 def test_every_task_measures_its_episodes_in_finite_numbers(task):
     for x, c, _ in zip(*fresh.draw(task, range(20), 0), strict=True):
         assert all(math.isfinite(value) for value in task.measures(x, c, default_params()).values())

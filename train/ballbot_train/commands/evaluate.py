@@ -64,7 +64,7 @@ def evaluate(
             default 100, or none if --randomization varies what optima depend on. Optima are stored in the user's cache
             folder, for later calls and other policies.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
-        workers: where certified episodes run and optima are computed.
+        workers: where episodes run and optima are computed.
         robot: name of the robot, with its episodes; default, the robot that the task names.
         randomization: name of a track, whose robots, delays and sensor errors are hidden from the policy.
         filter: filter in front of the policy: it estimates the robot, the delay, or the state from sensors.
@@ -129,7 +129,7 @@ def _evaluate_fresh(
     }
     with progress_bars({"episodes": count}) as advance:
         progress = partial(advance, "episodes")
-        result = episodes.evaluate_fresh(policy, task, count, seed, None, progress, robot, varied)
+        result = episodes.evaluate_fresh(policy, task, count, seed, None, progress, robot, varied, workers)
     if optima:
         result = result.with_optima(optima, workers)
     worst = _worst(result, policy, task, out / "worst", robot, varied)

@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -34,9 +34,10 @@ from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
 from ballbot_train.evaluation.controllers import as_controller, is_expert, make_controller
 from ballbot_train.evaluation.results import near_share, to_json, warn_of_small
 from ballbot_train.evaluation.statistics import share_interval
-from ballbot_train.policy.network import PolicyNetwork
+from ballbot_train.policy.compiled import compiled
+from ballbot_train.policy.network import PolicyController, PolicyNetwork
 from ballbot_train.work import jobs
-from ballbot_train.work.executors import Workers
+from ballbot_train.work.executors import Workers, completed
 
 with imports_of(__name__):
     import torch
@@ -286,7 +287,7 @@ def run_policy(
         PolicyError: a policy file that is damaged or of another task.
         TypeError: it is none of these.
     """
-    policy = _acting(policy, task, robot)
+    policy = _network_of(_acting(policy, task, robot))
     world: dict[str, Any] = {"randomization": randomization, "history": getattr(policy, "history", 0)}
     acts = isinstance(policy, ActionController) or callable(policy)
     plain = acts and not world["history"] and randomization == Randomization()
@@ -331,6 +332,14 @@ def _acting(policy: Any, task: Task, robot: str) -> Any:
             f"{policy!r} is not a policy: give a name, a file, a model with predict, or a function of tensors"
         )
     return policy
+
+
+def _network_of(policy: Any) -> Any:
+    """The network of a policy, with its layers in machine code; anything else as it is."""
+    network = policy.network if isinstance(policy, PolicyController) else policy
+    if not isinstance(network, PolicyNetwork) or (network is not policy and network.spec.informed):
+        return policy
+    return compiled(network)
 
 
 def _act(policy: Any, batch: BallbotBatch) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -393,6 +402,7 @@ def evaluate_fresh(
     on_progress: Callable[[int], None] = lambda count: None,
     robot: str = PAPER,
     randomization: Randomization | str | None = None,
+    workers: int | Workers = 1,
 ) -> FreshResult:
     """Runs a policy on fresh episodes.
 
@@ -405,22 +415,27 @@ def evaluate_fresh(
         on_progress: called with a number of finished episodes.
         robot: by name.
         randomization: parameters hidden from the policy, or a name in `TRACKS`; default, none.
+        workers: where the episodes run; for more than this process the policy must be a name or a file.
 
     Raises:
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
     """
     task, params, varied = make_task(task, robot), named_robot(robot), checked_randomization(randomization)
     check_fresh(policy, task, episodes, seed, robot)
-    states, constants, drawn = draw(task, range(episodes), seed, robot=robot, randomization=varied)
-    runs = []
-    for start in range(0, episodes, _BATCH):
-        x, c, own = (part[start : start + _BATCH] for part in (states, constants, drawn))
-        runs.append(run_policy(policy, task, x, c, own, robot, varied, torch.float64))
-        on_progress(len(x))
-    described = [task.measures(x, c, params) for x, c in zip(states, constants, strict=True)]
+    numbers = [range(episodes)[start : start + _BATCH] for start in range(0, episodes, _BATCH)]
+    problem = (policy, task, robot, varied, seed)
+    found: dict[int, _Part] = {}
+    for start, part in completed(((each.start, _part, (*problem, each)) for each in numbers), workers):
+        found[start] = part
+        on_progress(len(part.states))
+    parts = [found[start] for start in sorted(found)]
+    states, constants, drawn = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("states", "constants", "drawn")
+    )
+    runs = [part.run for part in parts]
     vary = {name: row for name, row in zip(Randomization.DRAWN, drawn.T, strict=False) if np.ptp(row) > 0}
     names = limit_names(task, params)
-    numbers = torch.cat([run.violated for run in runs]).tolist()
+    violated = torch.cat([run.violated for run in runs]).tolist()
     return FreshResult(
         task=task,
         policy=name or (str(policy) if isinstance(policy, str | Path) else type(policy).__name__),
@@ -430,15 +445,34 @@ def evaluate_fresh(
         costs=torch.cat([run.cost for run in runs]).numpy(),
         success=torch.cat([run.success for run in runs]).numpy(),
         failure=torch.cat([run.failure for run in runs]).numpy(),
-        violated=tuple(names[number] if number >= 0 else "" for number in numbers),
+        violated=tuple(names[number] if number >= 0 else "" for number in violated),
         durations=torch.cat([run.steps for run in runs]).numpy() * task.control_dt,
         goal_errors=torch.cat([run.goal_error for run in runs]).numpy(),
-        measures={key: np.array([entry[key] for entry in described]) for key in described[0]} | vary,
+        measures={key: np.concatenate([part.measures[key] for part in parts]) for key in parts[0].measures} | vary,
         optima=np.zeros(0),
         drawn=drawn,
         robot=robot,
         randomization=varied,
     )
+
+
+class _Part(NamedTuple):
+    """Some of the fresh episodes, as in `FreshResult`."""
+
+    states: np.ndarray
+    constants: np.ndarray
+    drawn: np.ndarray
+    run: BatchEpisodes
+    measures: dict[str, np.ndarray]
+
+
+def _part(policy: Any, task: Task, robot: str, varied: Randomization, seed: int, numbers: range) -> _Part:
+    """Episodes of the given numbers."""
+    states, constants, drawn = draw(task, numbers, seed, robot=robot, randomization=varied)
+    run = run_policy(policy, task, states, constants, drawn, robot, varied, torch.float64)
+    described = [task.measures(x, c, named_robot(robot)) for x, c in zip(states, constants, strict=True)]
+    measures = {key: np.array([entry[key] for entry in described]) for key in described[0]}
+    return _Part(states, constants, drawn, run, measures)
 
 
 def check_fresh(policy: Any, task: Task, episodes: int, seed: int, robot: str = PAPER) -> None:
