@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ballbot_gym.lazy import called, exports, need
 from ballbot_gym.robot import Robot
-from ballbot_gym.rollout import Controller
+from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ __all__ = [
     "Ocp",
     "OcpSolver",
     "Optimum",
+    "PlanError",
     "Regret",
     "Solution",
     "StateFromSensors",

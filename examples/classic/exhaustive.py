@@ -23,7 +23,7 @@ import tyro
 from ballbot_baselines import Backoff
 from ballbot_gym import TASKS, certified, files, machine_code, named_robot
 
-SOURCE = Path(__file__).with_name("grid.c")
+FOLDER = Path(__file__).parent
 FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 ACTIONS = {"pendulum": 13, "mountain_car": 7}  # of which the best is refined
 SHOWN = {"pendulum": (0, 2, 3), "mountain_car": (0, 1)}  # episodes in the picture
@@ -31,15 +31,17 @@ SHOWN = {"pendulum": (0, 2, 3), "mountain_car": (0, 1)}  # episodes in the pictu
 
 @dataclass(frozen=True)
 class System:
-    """What a grid needs of a task: an angle that wraps and another coordinate, as grid.c defines them."""
+    """What a grid needs of a task: an angle that wraps and another coordinate, as grid_NAME.c defines them."""
 
     low: float
     high: float
-    """Of the second coordinate."""
+    """Of the second coordinate. The mountain car has nodes at 0, the orbit of the wall, if 52 divides their number less 1."""
     shape: tuple[int, int]
     """Nodes of the coarser grid."""
     most: float
     """Above every value that matters."""
+    ages: int
+    """Control steps after which nodes that move are placed anew."""
     last_is_free: bool
     """Whether the last control step costs its own state alone, so that no action matters."""
     view: tuple[tuple[float, float], tuple[float, float]]
@@ -47,8 +49,10 @@ class System:
 
 
 SYSTEMS = {
-    "pendulum": System(-8.0, 8.0, (256, 201), 1e9, True, ((-np.pi, np.pi), (-8.0, 8.0))),
-    "mountain_car": System(0.0, 1.3, (96, 131), 2.0, False, ((-1.2, 0.45), (-0.055, 0.055))),
+    "pendulum": System(-8.0, 8.0, (256, 201), 1e9, 1, True, ((-np.pi, np.pi), (-8.0, 8.0))),
+    "mountain_car": System(
+        -4.125305251948621, 3.819727085137612, (96, 209), 100.0, 16, False, ((-1.2, 0.45), (-0.055, 0.055))
+    ),
 }
 
 
@@ -58,38 +62,47 @@ class _Grid(ctypes.Structure):
         ("high", ctypes.c_double * 2),
         ("nodes", ctypes.c_int64 * 2),
         ("actions", ctypes.c_int64),
+        ("age", ctypes.c_int64),
+        ("left", ctypes.c_int64),
         ("most", ctypes.c_double),
     )
 
 
 class Grid:
-    """Tables (nodes) of the least cost of what follows, of the control steps of an episode, backwards in time."""
+    """Tables (nodes + 1) of the least cost of what follows, of the control steps of an episode, backwards in time.
+
+    The last number of a table is the value where the system stops; see grid.c.
+    """
 
     def __init__(self, name: str, finer: float):
-        self._task, self._system = TASKS[name](), SYSTEMS[name]
+        self._name, self._task, self._system = name, TASKS[name](), SYSTEMS[name]
         count, others = self._system.shape
         self._shape = 2 * round(count * finer / 2), round((others - 1) * finer) + 1
-        source = f"#define PENDULUM {int(name == 'pendulum')}\n{SOURCE.read_text(encoding='utf-8')}"
+        source = "".join((FOLDER / file).read_text(encoding="utf-8") for file in (f"grid_{name}.c", "grid.c"))
         self._code = ctypes.CDLL(str(machine_code.library(f"grid-{name}", source, FLAGS)))
-        bounds = (-np.pi, self._system.low), (np.pi, self._system.high)
-        self._grid = _Grid(*bounds, self._shape, ACTIONS[name], self._system.most)
+        self._steps = self._task.steps - self._system.last_is_free  # in which an action matters
 
     def tables(self, keep: bool) -> list[np.ndarray]:
         """Those of steps 1 to the last, float32; where they are not kept, that of step 1 alone."""
-        shape, steps = self._shape, self._task.steps - self._system.last_is_free
-        later = np.full(shape, 0.0 if self._system.last_is_free else self._system.most, np.float32)
-        found = [later]
-        for _ in range(steps - 1):
-            now = np.empty(shape, np.float32)
-            self._code.sweep(ctypes.byref(self._grid), _pointer(found[-1]), _pointer(now))
+        size = self._shape[0] * self._shape[1] + 1
+        found = [np.full(size, 0.0 if self._system.last_is_free else self._system.most, np.float32)]
+        for step in range(self._steps - 1, 0, -1):
+            now, age = np.empty(size, np.float32), step % self._system.ages
+            self._code.sweep(self._table_of(step + 1), _pointer(found[-1]), ctypes.c_int64(age), _pointer(now))
             found = [*found, now] if keep else [now]
-            if keep and not len(found) % 50:
-                print(f"{len(found)} of {steps} tables", flush=True)
+            if not step % 50:
+                print(f"{self._name}, {self._shape[0]} × {self._shape[1]} nodes: {step} steps left", flush=True)
         return found[::-1]
 
+    def _table_of(self, step: int) -> Any:
+        """Where the nodes of the table of a step are."""
+        system = self._system
+        bounds, age = ((-np.pi, system.low), (np.pi, system.high)), step % system.ages
+        return ctypes.byref(_Grid(*bounds, self._shape, ACTIONS[self._name], age, self._steps - step, system.most))
+
     def values(self, table: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """The least costs (n,) from states (n, 2), by the table of the next step."""
-        return self._followed(table, states.copy(), np.zeros(len(states), np.uint8))[2]
+        """The least costs (n,) from states (n, 2) at the start, by the table of step 1."""
+        return self._followed(1, table, states.copy(), np.zeros(len(states), np.uint8))[2]
 
     def motions(self, tables: list[np.ndarray], states: np.ndarray) -> tuple[list[Any], np.ndarray]:
         """What following the grid's actions in the exact system gives from states (n, 2).
@@ -99,9 +112,9 @@ class Grid:
         """
         n, x, ended = len(states), states.copy(), np.zeros(len(states), np.uint8)
         path, taken, total, lengths = [x.copy()], [], np.zeros(n), np.zeros(n, int)
-        for table in tables:
+        for step, table in enumerate(tables, 1):
             lengths += ended == 0
-            actions, costs, _ = self._followed(table, x, ended)
+            actions, costs, _ = self._followed(step, table, x, ended)
             total += costs
             path.append(x.copy())
             taken.append(actions)
@@ -117,12 +130,15 @@ class Grid:
         return [(moved[i, : k + 1], applied[i, :k]) for i, k in enumerate(lengths)], total
 
     def _followed(
-        self, table: np.ndarray, states: np.ndarray, ended: np.ndarray
+        self, step: int, table: np.ndarray, states: np.ndarray, ended: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Actions, costs and values (n,) of a step; states (n, 2) and ended (n,) become those after it."""
+        """Actions, costs and values (n,) of the control step before that of a table.
+
+        States (n, 2) and ended (n,) become those after it.
+        """
         actions, costs, values = np.zeros((3, len(states)))
         pointers = map(_pointer, (states, actions, costs, values, ended))
-        self._code.follow(ctypes.byref(self._grid), _pointer(table), ctypes.c_int64(len(states)), *pointers)
+        self._code.follow(self._table_of(step), _pointer(table), ctypes.c_int64(len(states)), *pointers)
         return actions, costs, values
 
 

@@ -21,6 +21,7 @@ Guesses = list[tuple[np.ndarray, np.ndarray]]
 _SOLVED = 6  # guesses, of other numbers of turns
 _WORSE = 1.03  # times the best solution: where others cost more, better times do not make up for it
 _NEAR_STEPS = 20  # solutions that turn as often and arrive within these steps become the same at their best times
+_BETWEEN = 24  # control steps between the best times of motions that turn once more or less
 _BARRIER, _NEAR_BARRIER = 1e-3, 1e-6  # of the first iterate, and near a solution
 _STRIDE = 4  # of the search for the best time at first, control steps
 _ROOM = 1e-7  # kept from limits, so that rounding breaks none
@@ -143,7 +144,13 @@ class _Search:
 
     def _both(self, before: Solution, after: Solution) -> Iterator[Solution]:
         """Both parts at their best times; where there is no time for these, the second is hastened while that pays."""
-        before, least = self.best_time(before, self._task.steps - len(after.inputs), to_wall=True), math.inf
+        most, least = self._task.steps - len(after.inputs), math.inf
+        before = self.best_time(before, most, to_wall=True)
+        for steps in (len(before.inputs) - _BETWEEN, len(before.inputs) + _BETWEEN):
+            if before.is_optimal and 1 <= steps <= most:
+                other = self.solved(*self.motion(before), steps, to_wall=True, near=True)
+                other = self.best_time(other, most, to_wall=True)
+                before = min((each for each in (before, other) if each.is_optimal), key=lambda each: each.cost)
         while before.is_optimal and after.is_optimal and before.cost + after.cost < least:
             least, steps = before.cost + after.cost, len(after.inputs) - 1
             yield _joined(before, after)
