@@ -1,5 +1,6 @@
 """Results as an evaluation would have made them, plain controllers, and the example's systems, for tests."""
 
+import importlib.util
 import sys
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -99,3 +100,12 @@ def classic_systems():
             held.update(own)
         for name in [name for name in sys.modules if name.partition(".")[0] == "ballbot_classic"]:
             del sys.modules[name]
+
+
+def classic_script(name):
+    """A script of `examples/classic` as a module."""
+    spec = importlib.util.spec_from_file_location(name, CLASSIC / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where dataclasses look for their module
+    spec.loader.exec_module(module)
+    return module

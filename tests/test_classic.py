@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from builders import CLASSIC, classic_systems
+from builders import CLASSIC, classic_script, classic_systems
 
 import ballbot_baselines
 import ballbot_gym
@@ -89,13 +89,24 @@ def test_the_optimums_actions_earn_its_return_in_gymnasiums_own(name, seed):
     assert earned == pytest.approx(task.survival_pay - optimum.cost, abs=1e-5)
 
 
-@pytest.mark.parametrize(("name", "seed"), [("pendulum", 53), ("mountain_car", 176)])
+@pytest.mark.parametrize(("name", "seed"), [("pendulum", 53), ("mountain_car", 139), ("mountain_car", 176)])
 def test_the_search_finds_the_certified_optimum(name, seed):
     """In these episodes the best motion is close to other local optima, or starts from none of the cheapest guesses."""
     task, robot = make_task(name), robot_of(name)
     found = find_optimum(task, robot, *task.sample(np.random.default_rng(seed), robot))
     assert found.is_optimal
     assert found.cost == pytest.approx(certified.load(task, robot).costs[seed], rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COUNTERPARTS)
+def test_dynamic_programming_on_coarse_grids_nears_the_optima_and_finds_nothing_cheaper(name):
+    lines, *_ = classic_script("exhaustive").compared(name, finer=0.25, episodes=3)
+    for line in lines[::2]:
+        assert abs(line["finer_grid"] - line["optimum"]) < abs(line["grid"] - line["optimum"])
+        assert line["finer_grid"] == pytest.approx(line["optimum"], rel=0.06)
+        assert line["followed"] > line["optimum"] * (1 - 1e-5)
+        assert line["improved"] > line["optimum"] * (1 - 1e-6)
 
 
 def test_the_goal_pays_and_missing_it_costs_as_much():

@@ -66,7 +66,9 @@ def main(episodes: int = 50, out: Path = Path("runs/acrobot-families.csv")) -> N
     searches = {"right": OneSide(side=1), "left": OneSide(side=-1), "one_guess": OneGuess()}
     lines = []
     for seed, (x0, optimum) in enumerate(zip(known.states[:episodes], known.costs[:episodes], strict=True)):
-        lines.append({"seed": seed, "optimum": float(optimum)} | {name: cost(task, x0) for name, task in searches.items()})
+        lines.append(
+            {"seed": seed, "optimum": float(optimum)} | {name: cost(task, x0) for name, task in searches.items()}
+        )
         print(lines[-1], flush=True)
     files.write_csv(out, lines)
     column = {key: np.array([line[key] for line in lines]) for key in lines[0]}
