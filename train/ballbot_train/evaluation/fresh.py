@@ -415,7 +415,8 @@ def evaluate_fresh(
         on_progress: called with a number of finished episodes.
         robot: by name.
         randomization: parameters hidden from the policy, or a name in `TRACKS`; default, none.
-        workers: where the episodes run; for more than this process the policy must be a name or a file.
+        workers: where the episodes run; for more than this process the policy must be a name or a file. A few
+            run here.
 
     Raises:
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
@@ -425,6 +426,7 @@ def evaluate_fresh(
     numbers = [range(episodes)[start : start + _BATCH] for start in range(0, episodes, _BATCH)]
     problem = (policy, task, robot, varied, seed)
     found: dict[int, _Part] = {}
+    workers = workers if len(numbers) > 1 else 1  # a few run sooner than processes start
     for start, part in completed(((each.start, _part, (*problem, each)) for each in numbers), workers):
         found[start] = part
         on_progress(len(part.states))
