@@ -34,7 +34,7 @@ class QuadraticCritic(torch.nn.Module):
         """
         super().__init__()
         self._shown, self._entries = shown, entries
-        size = entries + entries**2 + past
+        size = entries + entries * (entries + 1) // 2 + past
         self.mlp = linear_layers((size, *hidden, 1), activation)
         self.linear = torch.nn.Linear(size, 1)
         self.start_flat()
@@ -48,10 +48,10 @@ class QuadraticCritic(torch.nn.Module):
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(B, observations) to values (B, 1)."""
         shown = self._shown(observation)
-        seen, past = shown[:, : self._entries], shown[:, self._entries :]
-        # every pair is there twice: to leave one of them out takes eight times as long
-        products = torch.einsum("ni,nj->nij", seen, seen).flatten(1)
-        inputs = torch.cat([seen, products, past], -1)
+        rows = shown.t().contiguous()  # products of rows are much faster than those of columns
+        seen, past = rows[: self._entries], rows[self._entries :]
+        products = (seen[i] * seen[i:] for i in range(self._entries))
+        inputs = torch.cat([seen, *products, past]).t()
         return self.mlp(inputs) + self.linear(inputs)
 
 

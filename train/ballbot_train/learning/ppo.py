@@ -74,7 +74,6 @@ TUNED: dict[str, PpoConfig] = {
     ),
     "weave": PpoConfig(
         final_gamma=0.994,
-        hidden=(128, 128),
         short_episodes=(0.3, 0.6),
         symmetry="centred",
         final_learning_rate_fraction=0.02,
