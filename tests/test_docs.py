@@ -1,6 +1,7 @@
 """What README and documentation say runs as it stands, as a reader would paste it, page by page."""
 
 import dataclasses
+import hashlib
 import json
 import math
 import re
@@ -319,6 +320,15 @@ def test_version_is_the_same_everywhere():
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"version = {{{version}}}" in (ROOT / "README.md").read_text()
     assert f"## [{version}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_metadata_for_search_engines_describes_the_certified_sets_as_they_are():
+    """Where this fails, `make metadata` writes them anew."""
+    described = json.loads((ROOT / "docs" / "certified.croissant.json").read_text())["distribution"]
+    held = {each["name"]: (each["sha256"], each["contentSize"]) for each in described}
+    sets = (ROOT / "ballbot_gym" / "certified").glob("*.npz")
+    contents = {path.name: path.read_bytes() for path in sets}
+    assert held == {name: (hashlib.sha256(of).hexdigest(), f"{len(of)} B") for name, of in contents.items()}
 
 
 @pytest.mark.slow
