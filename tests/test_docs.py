@@ -52,7 +52,7 @@ def pages_with(language):
 def test_python_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     learn = PPO.learn
-    monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, min(steps, 4096), *more))
+    monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, min(steps, 2048), *more))
     namespace = {"__name__": "example"}
     with classic_systems() if page.name == "classic.md" else nullcontext():
         for block in blocks(page, "python"):

@@ -69,6 +69,6 @@ def test_a_search_trains_with_proposed_settings_and_continues_its_study(capsys, 
     pytest.importorskip("optuna")
     tiny = "--iterations 1 --evaluations 1 --num-envs 4 --batch-size 16 --hidden 4 --test-episodes 1 --validation-episodes 2"
     for _ in range(2):  # the second time there is nothing left to do
-        load("tune").main("turn", 1, 1, f"{tiny} --episode-seconds 1", tmp_path)
+        load("tune").main("stabilize", 1, 1, f"{tiny} --episode-seconds 1", tmp_path)
     assert capsys.readouterr().out.count("the best, trial 0, costs") == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["study.db", "trial-0"]
