@@ -102,10 +102,9 @@ def classic_systems():
             del sys.modules[name]
 
 
-def classic_script(name):
-    """A script of `examples/classic` as a module."""
-    spec = importlib.util.spec_from_file_location(name, CLASSIC / f"{name}.py")
+def script(path):
+    """A file of `examples` as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # where dataclasses look for their module
     spec.loader.exec_module(module)
     return module

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from builders import CLASSIC, classic_script, classic_systems
+from builders import CLASSIC, classic_systems, script
 
 import ballbot_baselines
 import ballbot_gym
@@ -101,7 +101,7 @@ def test_the_search_finds_the_certified_optimum(name, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COUNTERPARTS)
 def test_dynamic_programming_on_coarse_grids_nears_the_optima_and_finds_nothing_cheaper(name):
-    lines, *_ = classic_script("exhaustive").compared(name, finer=0.25, episodes=3)
+    lines, *_ = script(CLASSIC / "exhaustive.py").compared(name, finer=0.25, episodes=3)
     for line in lines[::2]:
         assert abs(line["finer_grid"] - line["optimum"]) < abs(line["grid"] - line["optimum"])
         assert line["finer_grid"] == pytest.approx(line["optimum"], rel=0.06)

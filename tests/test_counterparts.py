@@ -6,7 +6,7 @@ import gymnasium
 import minari
 import numpy as np
 import pytest
-from builders import CLASSIC, classic_script, classic_systems
+from builders import CLASSIC, classic_systems, script
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -117,7 +117,7 @@ def test_a_model_its_file_and_its_function_have_the_same_regret(kind, options, t
 
 
 def test_agents_are_trained_with_the_settings_of_the_zoo_and_measured(tmp_path, capsys):
-    agents = classic_script("agents")
+    agents = script(CLASSIC / "agents.py")
     agents.train("MountainCarContinuous-v0", "ppo", out=tmp_path, steps=8)
     model = agents.loaded(tmp_path / "MountainCarContinuous-v0-ppo-0.zip", "MountainCarContinuous-v0", "ppo")
     assert (model.gamma, model.use_sde, model.n_steps) == (0.9999, True, 8)
@@ -138,13 +138,13 @@ def test_agents_are_trained_with_the_settings_of_the_zoo_and_measured(tmp_path, 
 @pytest.mark.parametrize("system", ["pendulum", "mountain-car"])
 def test_the_page_of_agents_shows_the_tables_of_its_data(system):
     data = EXPERIMENTS / f"classic-{system}.csv"
-    assert classic_script("agents").markdown(data) in (EXPERIMENTS / "classic-agents.md").read_text()
+    assert script(CLASSIC / "agents.py").markdown(data) in (EXPERIMENTS / "classic-agents.md").read_text()
 
 
 def test_datasets_hold_the_optimum_of_every_seed_and_its_score(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     with pytest.warns(UserWarning, match="is set to None"):
-        classic_script("minari_dataset").main("Pendulum-v1", episodes=2)
+        script(CLASSIC / "minari_dataset.py").main("Pendulum-v1", episodes=2)
     dataset = minari.load_dataset("pendulum/optimum-v0")
     returns = np.array([float(each.rewards.sum()) for each in dataset])
     np.testing.assert_allclose(returns, [best(0), best(1)], atol=1e-5)

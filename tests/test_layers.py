@@ -8,7 +8,7 @@ import torch
 from ballbot_gym.machine_code import compiler
 from ballbot_gym.tasks import Stabilize, Turn
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.policy.compiled import compiled
+from ballbot_train.policy.layers import with_compiled_layers
 from ballbot_train.policy.network import PolicyNetwork
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
@@ -22,12 +22,12 @@ def test_actions_are_those_of_torch(activation, hidden, task, symmetry, count):
     network = PolicyNetwork(replace(spec_for(task, symmetry, hidden), activation=activation))
     seen = 2 * torch.randn(count, network.spec.observations)
     with torch.no_grad():
-        assert torch.allclose(compiled(network)(seen), network(seen), atol=2e-6)
+        assert torch.allclose(with_compiled_layers(network)(seen), network(seen), atol=2e-6)
 
 
 def test_the_policy_itself_stays_as_it_is():
     network = PolicyNetwork(spec_for(Stabilize(), "odd", (8,)))
-    compiled(network)
+    with_compiled_layers(network)
     assert isinstance(network.mlp, torch.nn.Sequential)
     assert network(torch.ones(1, network.spec.observations)).requires_grad
 
@@ -37,4 +37,4 @@ def test_activations_stay_finite_and_within_their_bounds_far_out():
     with torch.no_grad():
         network.mlp[0].weight.mul_(1e20)
         seen = torch.randn(50, network.spec.observations)
-        assert torch.allclose(compiled(network)(seen), network(seen), atol=2e-6)
+        assert torch.allclose(with_compiled_layers(network)(seen), network(seen), atol=2e-6)

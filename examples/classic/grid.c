@@ -11,7 +11,7 @@
        drift           how nodes move from step to step
        moved           a control step; whether it ends the episode (ARRIVED) or at the system's stop (STOPPED)
        stop            the state there
-       direct          the least cost of ending soon, or one above `most`
+       direct          the least cost of ending soon, or `most` where that is not known
 
    A table has a number for each node, and the value of the stop behind them. */
 

@@ -34,7 +34,7 @@ from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
 from ballbot_train.evaluation.controllers import as_controller, is_expert, make_controller
 from ballbot_train.evaluation.results import near_share, to_json, warn_of_small
 from ballbot_train.evaluation.statistics import share_interval
-from ballbot_train.policy.compiled import compiled
+from ballbot_train.policy.layers import with_compiled_layers
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
 from ballbot_train.work import jobs
 from ballbot_train.work.executors import Workers, completed
@@ -339,7 +339,7 @@ def _network_of(policy: Any) -> Any:
     network = policy.network if isinstance(policy, PolicyController) else policy
     if not isinstance(network, PolicyNetwork) or (network is not policy and network.spec.informed):
         return policy
-    return compiled(network)
+    return with_compiled_layers(network)
 
 
 def _act(policy: Any, batch: BallbotBatch) -> Callable[[torch.Tensor], torch.Tensor]:

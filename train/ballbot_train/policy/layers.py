@@ -19,12 +19,12 @@ with imports_of(__name__):
     import torch
 
 _SOURCE = Path(__file__).with_name("layers.c")
-_FLAGS = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
 _ACTIVATIONS = ("tanh", "relu", "silu")  # in the order of layers.c
 _WIDEST = 1024  # numbers between layers
+_FLAGS = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", f"-DWIDEST={_WIDEST}")
 
 
-def compiled(network: PolicyNetwork) -> PolicyNetwork:
+def with_compiled_layers(network: PolicyNetwork) -> PolicyNetwork:
     """The same policy with its layers in machine code, without gradients; or the policy itself where that cannot be made.
 
     Its actions differ from torch's by the rounding of single precision.
@@ -54,7 +54,7 @@ class _Layers(torch.nn.Module):
         if max(widths) > _WIDEST:
             raise NoMachineCodeError(f"layers of {max(widths)} units are wider than {_WIDEST}")
         self._outputs, self._function = widths[-1], _library().layers
-        # tensors that nobody changes, and that stay where they are as long as this
+        # kept, so that the pointers stay valid
         self._kept = [
             [None if part is None else part.detach().contiguous() for part in (layer.weight, layer.bias)]
             for layer in linear
