@@ -1,9 +1,11 @@
 """Tasks whose cost, goal and observation depend on the episode's time: examples/figure_eight.py and examples/waypoints.py."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from test_examples import load
+from builders import script
 
 from ballbot_baselines import LqrController, NmpcController, TrajoptController, find_optima, find_optimum, regret
 from ballbot_gym import BallbotEnv
@@ -15,12 +17,13 @@ from ballbot_train.learning.apg import ApgConfig
 from ballbot_train.learning.learners import LEARNERS
 
 STEPS = 16
+EXAMPLES = Path(__file__).parents[1] / "examples"
 CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
 
 
 @pytest.fixture(params=CLASSES)
 def task(request):
-    return getattr(load(request.param), CLASSES[request.param])()
+    return getattr(script(EXAMPLES / f"{request.param}.py"), CLASSES[request.param])()
 
 
 def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, params):
@@ -95,7 +98,7 @@ def test_the_optimum_repeats_in_the_env_at_its_cost_and_controllers_come_near_it
 
 
 def test_where_the_robot_is_linear_lqr_along_a_moving_reference_is_optimal_but_for_its_price_of_the_end(params):
-    task, x, c = load("figure_eight").FigureEight(), np.zeros(8), np.array([0.02])
+    task, x, c = script(EXAMPLES / "figure_eight.py").FigureEight(), np.zeros(8), np.array([0.02])
     x[0] = 0.02
     env = BallbotEnv(task, physics="rk4", params=params)
     tracked = rollout(env, LqrController(task, params), options={"state": x, "constants": c})
