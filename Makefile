@@ -111,7 +111,7 @@ platforms: .venv-pythons/uv/$(SCRIPTS)/uv
 # the C code of all shipped robots and tasks
 code: build/code/codes.json
 
-build/code/codes.json: $(VENV)/installed $(shell find ballbot_gym baselines -name "*.py" -o -name "*.[ch]")
+build/code/codes.json: $(VENV)/installed $(shell find ballbot_gym baselines train -name "*.py" -o -name "*.[ch]")
 	rm -f build/code/*.c build/code/source/*
 	$(BIN)/python release/generated.py build/code
 

@@ -8,9 +8,10 @@ The libraries are compiled too, into the user's cache, because optima and expert
 import itertools
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector import native
+from ballbot_train import evaluate_fresh
 
 EXPERTS = ("nmpc", "trajopt")
 """The experts that compile something; LQR compiles nothing."""
@@ -94,18 +96,29 @@ def experts(task: str, robot: str) -> None:
             rollout(BallbotEnv(made, physics="rk4", robot=params), CONTROLLERS[name](made, params), seed=0)
 
 
+def policies() -> None:
+    """Runs a policy in many episodes at once. All policies run by the same code."""
+    evaluate_fresh("shac", "stabilize", _BATCH, workers=1)
+
+
+def runs() -> Iterator[tuple[str, Callable[[], None]]]:
+    """What is run so that all code is asked for. Experts of robots with wheels are left out: they take minutes."""
+    yield "policies", policies
+    for robot, task in itertools.product(ROBOTS, TASKS):
+        yield f"{robot} {task}", partial(environments, task, robot)
+        if not ROBOTS[robot].params.LONG_EQUATIONS:
+            yield f"{robot} {task} experts", partial(experts, task, robot)
+
+
 def generated() -> Iterator[Code]:
-    """The code of every shipped robot and task, each once. Experts of robots with wheels are left out: they take minutes."""
+    """The code of every shipped robot and task, each once."""
     seen: set[Code] = set()
-    for robot in ROBOTS:
-        for task in TASKS:
-            with recorded() as found:
-                environments(task, robot)
-                if not ROBOTS[robot].params.LONG_EQUATIONS:
-                    experts(task, robot)
-            yield from (code for code in found if code not in seen)
-            seen |= set(found)
-            print(f"{robot} {task}: {len(seen)} libraries so far", flush=True)
+    for name, run in runs():
+        with recorded() as found:
+            run()
+        yield from (code for code in found if code not in seen)
+        seen |= set(found)
+        print(f"{name}: {len(seen)} libraries so far", flush=True)
 
 
 def write(codes: Iterator[Code], folder: Path) -> None:
