@@ -52,6 +52,15 @@ assert not learners, learners
 """
 """What an installation without extras does."""
 
+LAYERS = """
+from ballbot_train.policy.layers import with_compiled_layers
+from ballbot_train.policy.network import PolicyNetwork
+from ballbot_train.policy.files import PolicySpec
+network = PolicyNetwork(PolicySpec("", 8, (16,)))
+assert with_compiled_layers(network) is not network, "compiled layers of policies are missing or unused"
+"""
+"""Whether the wheel with compiled code brings that of policies."""
+
 
 class Stranger:
     """A new virtual environment outside of the repository, with one distribution and some extras."""
@@ -112,6 +121,7 @@ def check(distribution: Path, extras: str) -> None:
         if extras == "[baselines]":
             print(stranger.run("python", "-", code=ten_lines()), end="")
         if extras == "[train]":
+            stranger.run("python", "-", code=LAYERS)
             stranger.run("ballbot", "benchmark", "--episodes", "2")
             assert (stranger.folder / "runs/benchmark/report.html").exists()
         assert not (stranger.folder / "file" / "home").exists()
