@@ -44,6 +44,7 @@ def evaluate(
     physics: Physics | None = None,
     seed: int = 0,
     optima: int | None = None,
+    adversarial: bool = False,
     out: Path | None = None,
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
@@ -63,6 +64,7 @@ def evaluate(
         optima: number of fresh episodes, from the first, for which the optimum is computed too, so that they have a regret;
             default 100, or none if --randomization varies what optima depend on. Optima are stored in the user's cache
             folder, for later calls and other policies.
+        adversarial: search for worse starts, too, from the 1,000 hardest of the fresh episodes.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
         workers: where episodes run and optima are computed.
         robot: name of the robot, with its episodes; default, the robot that the task names.
@@ -81,8 +83,10 @@ def evaluate(
             raise ValueError("fresh episodes run in the batched closed-form model; leave out --physics")
         if optima is None:
             optima = 0 if varied.moves_optima else min(_OPTIMA, fresh)
-        _evaluate_fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
+        _evaluate_fresh(policy, task, fresh, seed, optima, adversarial, out, workers, robot, varied)
         return
+    if adversarial:
+        raise ValueError("a search for hard starts begins at fresh episodes; give --fresh with --adversarial")
     if optima:
         raise ValueError("certified episodes already have optima; give --optima with --fresh")
     engine, count = physics_or_default(physics, robot), checked_episodes(episodes)
@@ -103,6 +107,7 @@ def _evaluate_fresh(
     count: int,
     seed: int,
     optima: int,
+    adversarial: bool,
     out: Path,
     workers: Workers,
     robot: str,
@@ -114,6 +119,14 @@ def _evaluate_fresh(
     if optima > count:
         raise ValueError(f"optima must be at most the {count} fresh episodes, not {optima}")
     episodes.check_fresh(policy, make_task(task, robot), count, seed, robot)  # before anything is written
+    if adversarial:
+        from ballbot_train.evaluation.adversarial import check_searchable
+
+        if varied.active:
+            raise ValueError(
+                "a search for hard starts needs a robot from which nothing is hidden; leave out --randomization"
+            )
+        check_searchable(make_task(task, robot))
     jobs.make_folder(out)
     of = {"task": task, "policy": policy, "robot": robot, "randomization": track_of(varied)}
     if (out / "fresh.json").exists():  # of the same policy they are replaced
@@ -136,6 +149,37 @@ def _evaluate_fresh(
     result.write(worst, facts, out)
     _print(result, worst)
     console.print(f"all episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
+    if adversarial:
+        _search(result, policy, task, out, workers, robot)
+
+
+def _search(result: Any, policy: str, task: str, out: Path, workers: Workers, robot: str) -> None:
+    """Searches for worse starts than the fresh episodes have, and writes them all, and the motions of the worst ten."""
+    from ballbot_train.evaluation import adversarial
+
+    with progress_bars({"searches": min(adversarial.SEARCHES, len(result))}) as advance:
+        began, ended = adversarial.hard_starts(policy, result, workers, partial(advance, "searches"))
+    numbers = {name: getattr(ended, name).tolist() for name in ("success", "failure", "costs", "optima", "regrets")}
+    numbers |= {"regrets_before": began.regrets.tolist()}
+    numbers |= {f"x{k}": values.tolist() for k, values in enumerate(ended.states.T)}
+    numbers |= dict(zip(result.task.constant_names, ended.constants.T.tolist(), strict=True))
+    lines = [dict(zip(numbers, values, strict=True)) for values in zip(*numbers.values(), strict=True)]
+    files.write_csv(out / "adversarial.csv", lines)
+    folder = out / "adversarial"
+    for stale in folder.glob("start-*.npz"):  # of an earlier search
+        stale.unlink()
+    env, rows = BallbotEnv(task, physics="rk4", robot=robot), []
+    controller = make_controller(policy, env.task, env.params)
+    for i, line in enumerate(lines[:_WORST]):
+        options = {"state": ended.states[i], "constants": ended.constants[i]}
+        path = rollout(env, controller, seed=0, options=options).trajectory.save(folder / f"start-{i}.npz")
+        end = "fails" if line["failure"] else f"{line['regrets']:.1%}" if line["success"] else "goal missed"
+        rows.append([str(i), shlex.join(["ballbot", "replay", str(path)]), end, f"{line['costs']:.1f}"])
+    env.close()
+    failed, missed = int(ended.failure.sum()), int((~ended.success & ~ended.failure).sum())
+    title = f"{len(lines)} searches for hard starts: {failed} ended in a failure, {missed} in a missed goal"
+    print_table(title, ["start", "look at it with", "regret", "cost"], rows)
+    console.print(f"where all searches ended: {out / 'adversarial.csv'}")
 
 
 def _worst(

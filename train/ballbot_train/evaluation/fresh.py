@@ -246,16 +246,30 @@ def draw(
         robot: by name.
         randomization: what robots and actuators are drawn from.
     """
-    entropy, params, drawn = zlib.crc32(task.id.encode()), named_robot(robot), []
-
-    def rng(*key: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, *key)))
-
+    params, drawn = named_robot(robot), []
     for i in episodes:
-        z = tuple(rng(i, 1).random(len(Randomization.DRAWN)).tolist()) if randomization.varies_episodes else ()
-        drawn.append((*task.sample(rng(i), params), randomization.draw(z, task.control_dt) if z else ()))
+        hidden = (
+            _rng(task, seed, purpose, i, 1).random(len(Randomization.DRAWN)) if randomization.varies_episodes else ()
+        )
+        z = tuple(map(float, hidden))
+        start = task.sample(_rng(task, seed, purpose, i), params)
+        drawn.append((*start, randomization.draw(z, task.control_dt) if z else ()))
     x, c, robots = map(np.array, zip(*drawn, strict=True))
     return x, c, robots
+
+
+def numbers_of(task: Task, episodes: Iterable[int], seed: int) -> np.ndarray:
+    """The uniform numbers (n, k) that `draw` turns into constants and initial states, for a task that does not sample in
+    its own way; see `Task.sample`.
+    """
+    count = task.constant_draws + task.state_draws
+    return np.stack([_rng(task, seed, "evaluation", int(i)).random(count) for i in episodes])
+
+
+def _rng(task: Task, seed: int, purpose: str, *key: int) -> np.random.Generator:
+    """The generator of an episode."""
+    entropy = zlib.crc32(task.id.encode())
+    return np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, *key)))
 
 
 def run_policy(

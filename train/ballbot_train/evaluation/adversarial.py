@@ -1,0 +1,165 @@
+"""The worst starts of a policy: a search in the set from which a task draws its episodes.
+
+A policy that fails in none of 10,000 fresh episodes may still fail from some start. An episode is a function of uniform
+random numbers, so each episode is a point of a cube. A search begins at a hard episode. It moves its point by random steps,
+and keeps the moves that make the episode harder: by more regret, by a missed goal, and at last by a failure. The steps
+become smaller from round to round.
+"""
+
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ballbot_baselines import find_optima, find_optimum
+from ballbot_gym.lazy import imports_of
+from ballbot_gym.robot import named_robot
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import Task
+from ballbot_train.evaluation.fresh import FreshResult, numbers_of, priced, run_policy
+from ballbot_train.work.executors import Workers, completed
+
+with imports_of(__name__):
+    import torch
+
+SEARCHES = 1000
+ROUNDS = 30
+_CONSIDERED = 10  # times as many episodes as searches, of which the hardest are taken
+_LARGEST, _SMALLEST = 0.1, 0.003  # standard deviations of the steps in the unit cube, in the first and the last round
+_TOGETHER = 100  # searches of a task of a worker
+_CHECKED = 2  # of these, how many end with an optimum that was searched for as those of certified episodes are
+_MISSED, _FAILED = 1e6, 2e6  # how hard an episode without success is, and one that fails; no regret is as large
+
+
+@dataclass(frozen=True)
+class Starts:
+    """n episodes of a policy."""
+
+    numbers: np.ndarray
+    """(n, k) in [0, 1), from which the task makes an episode."""
+    states: np.ndarray
+    """(n, 8) initial states."""
+    constants: np.ndarray
+    """(n, nc)."""
+    costs: np.ndarray
+    """(n,) the price of a failure included."""
+    optima: np.ndarray
+    """(n,) optimal costs; NaN where none was found."""
+    success: np.ndarray
+    """(n,) bool."""
+    failure: np.ndarray
+    """(n,) bool."""
+
+    @property
+    def regrets(self) -> np.ndarray:
+        """(n,) cost / optimum − 1, NaN without success."""
+        return np.where(self.success, self.costs / self.optima - 1, np.nan)
+
+    @property
+    def hardness(self) -> np.ndarray:
+        """(n,) the regret of an episode with success; where its optimum is not known, less than any."""
+        regrets = np.nan_to_num(self.regrets, nan=-1.0)
+        return np.where(self.failure, _FAILED, np.where(self.success, regrets, _MISSED))
+
+    def at(self, chosen: np.ndarray) -> "Starts":
+        """Some of them."""
+        return Starts(**{name: values[chosen] for name, values in asdict(self).items()})
+
+    def and_(self, others: "Starts") -> "Starts":
+        """All of both."""
+        theirs = asdict(others)
+        return Starts(**{name: np.concatenate([values, theirs[name]]) for name, values in asdict(self).items()})
+
+
+def hard_starts(
+    policy: Any,
+    result: FreshResult,
+    workers: int | Workers = 1,
+    on_progress: Callable[[int], None] = lambda count: None,
+    searches: int = SEARCHES,
+    rounds: int = ROUNDS,
+) -> tuple[Starts, Starts]:
+    """Searches for worse starts than those of fresh episodes. The same seed gives the same starts.
+
+    Args:
+        policy: what ran in the fresh episodes; see `fresh.run_policy`.
+        result: the fresh episodes, of a robot from which nothing is hidden.
+        workers: where the episodes run; for more than this process the policy must be a name or a file.
+        on_progress: called with a number of finished searches.
+        searches: from how many of the hardest fresh episodes a search begins.
+        rounds: how many steps each search tries.
+
+    Returns:
+        Where the searches began and where they ended, the hardest end first.
+
+    Raises:
+        ValueError: the task draws its episodes in another way than by `draw_constants` and `draw_state`, or the
+            episodes have hidden parameters.
+    """
+    task = result.task
+    check_searchable(task)
+    if result.randomization.active:
+        raise ValueError(
+            "a search for hard starts needs a robot from which nothing is hidden; leave out --randomization"
+        )
+
+    def done(function: Callable[..., Starts], numbers: np.ndarray, *others: Any) -> Starts:
+        """What a function makes of all numbers, some at a time."""
+        chunks = range(0, len(numbers), _TOGETHER)
+        work = ((k, function, (policy, task, result.robot, numbers[k : k + _TOGETHER], *others)) for k in chunks)
+        found: dict[int, Starts] = {}
+        for k, part in completed(work, workers if len(chunks) > 1 else 1):
+            found[k] = part
+            if others:
+                on_progress(len(part.costs))
+        joined = found[0]
+        for k in chunks[1:]:
+            joined = joined.and_(found[k])
+        return joined
+
+    expensive = np.argsort(-priced(result.costs, result.success, task), kind="stable")[: _CONSIDERED * searches]
+    began = done(_run, numbers_of(task, expensive, result.seed))
+    began = began.at(np.argsort(-began.hardness, kind="stable")[:searches])
+    ended = done(_search, began.numbers, rounds, result.seed)
+    order = np.argsort(-ended.hardness, kind="stable")
+    return began.at(order), ended.at(order)
+
+
+def check_searchable(task: Task) -> None:
+    """Raises a ValueError for a task whose episodes are no functions of uniform numbers."""
+    if type(task).sample is not Task.sample or task.constant_draws + task.state_draws == 0:
+        raise ValueError(
+            f"{type(task).__name__} does not draw its episodes by draw_constants and draw_state alone, so there is no set "
+            "of starts to search in"
+        )
+
+
+def _search(policy: Any, task: Task, robot: str, numbers: np.ndarray, rounds: int, seed: int) -> Starts:
+    """Where searches from numbers (n, k) end: the same in whichever process they run."""
+    rng = np.random.default_rng([seed, zlib.crc32(numbers.tobytes())])
+    now = _run(policy, task, robot, numbers)
+    n = np.arange(len(numbers))
+    for step in np.geomspace(_LARGEST, _SMALLEST, rounds):
+        moved = now.numbers + step * rng.standard_normal(numbers.shape)
+        moved = np.minimum(1 - np.abs(1 - np.abs(moved)), np.nextafter(1.0, 0.0))  # reflected at both ends
+        tried = _run(policy, task, robot, moved)
+        now = now.and_(tried).at(n + len(n) * (tried.hardness > now.hardness))
+    for i in np.argsort(-now.hardness, kind="stable")[:_CHECKED]:
+        with suppress(PlanError):
+            cost = find_optimum(task, robot, now.states[i], now.constants[i], twice=True).cost
+            now.optima[i] = np.fmin(now.optima[i], cost)
+    return now
+
+
+def _run(policy: Any, task: Task, robot: str, numbers: np.ndarray) -> Starts:
+    """The episodes of numbers (n, k)."""
+    params, few = named_robot(robot), task.constant_draws
+    constants = [task.draw_constants(tuple(row[:few]), params) for row in numbers.tolist()]
+    states = [task.start(tuple(row[few:]), c, params) for row, c in zip(numbers.tolist(), constants, strict=True)]
+    x, c = np.array(states, np.float64), np.array(constants, np.float64).reshape(len(numbers), -1)
+    run = run_policy(policy, task, x, c, np.zeros((len(x), 0)), robot, dtype=torch.float64)
+    optima = np.array([np.nan if each is None else each.cost for each in find_optima(task, robot, x, c)])
+    return Starts(numbers, x, c, run.cost.numpy(), optima, run.success.numpy(), run.failure.numpy())
