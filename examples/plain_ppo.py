@@ -17,8 +17,8 @@ from torch import nn
 import ballbot_gym  # noqa: F401
 from ballbot_train import BallbotVecEnv, evaluate
 
-STEPS = 3_072_000
-"""Env steps in all: 120 rollouts."""
+STEPS = 6_144_000
+"""Env steps in all: 240 rollouts."""
 
 
 class Products(nn.Module):
@@ -52,7 +52,7 @@ def train(steps: int, seed: int) -> PPO:
         n_epochs=5,
         gamma=0.995,
         gae_lambda=0.9,
-        policy_kwargs={"net_arch": [32, 32], "log_std_init": -1.6},
+        policy_kwargs={"net_arch": [32, 32], "log_std_init": -2.0},
         seed=seed,
         device="cpu",
     )
