@@ -122,11 +122,7 @@ def _evaluate_fresh(
     if adversarial:
         from ballbot_train.evaluation.adversarial import check_searchable
 
-        if varied.active:
-            raise ValueError(
-                "a search for hard starts needs a robot from which nothing is hidden; leave out --randomization"
-            )
-        check_searchable(make_task(task, robot))
+        check_searchable(make_task(task, robot), varied)
     jobs.make_folder(out)
     of = {"task": task, "policy": policy, "robot": robot, "randomization": track_of(varied)}
     if (out / "fresh.json").exists():  # of the same policy they are replaced
@@ -165,17 +161,10 @@ def _search(result: Any, policy: str, task: str, out: Path, workers: Workers, ro
     numbers |= dict(zip(result.task.constant_names, ended.constants.T.tolist(), strict=True))
     lines = [dict(zip(numbers, values, strict=True)) for values in zip(*numbers.values(), strict=True)]
     files.write_csv(out / "adversarial.csv", lines)
-    folder = out / "adversarial"
-    for stale in folder.glob("start-*.npz"):  # of an earlier search
-        stale.unlink()
-    env, rows = BallbotEnv(task, physics="rk4", robot=robot), []
-    controller = make_controller(policy, env.task, env.params)
-    for i, line in enumerate(lines[:_WORST]):
-        options = {"state": ended.states[i], "constants": ended.constants[i]}
-        path = rollout(env, controller, seed=0, options=options).trajectory.save(folder / f"start-{i}.npz")
-        end = "fails" if line["failure"] else f"{line['regrets']:.1%}" if line["success"] else "goal missed"
-        rows.append([str(i), shlex.join(["ballbot", "replay", str(path)]), end, f"{line['costs']:.1f}"])
-    env.close()
+    shown, rows = range(len(lines))[:_WORST], []
+    for i, command in enumerate(_motions("start", shown, ended, policy, task, out / "adversarial", robot)):
+        end = "fails" if ended.failure[i] else f"{ended.regrets[i]:.1%}" if ended.success[i] else "goal missed"
+        rows.append([str(i), command, end, f"{ended.costs[i]:.1f}"])
     failed, missed = int(ended.failure.sum()), int((~ended.success & ~ended.failure).sum())
     title = f"{len(lines)} searches for hard starts: {failed} ended in a failure, {missed} in a missed goal"
     print_table(title, ["start", "look at it with", "regret", "cost"], rows)
@@ -186,21 +175,49 @@ def _worst(
     result: Any, policy: str, task: str, folder: Path, robot: str, varied: Randomization
 ) -> list[dict[str, Any]]:
     """The worst episodes, each with its trajectory in a file that `ballbot replay` draws."""
+    numbers, worst = result.worst(_WORST), []
+    commands = _motions("episode", numbers, result, policy, task, folder, robot, varied)
+    for i, command in zip(numbers, commands, strict=True):
+        constants = dict(zip(result.task.constant_names, result.constants[i].tolist(), strict=True))
+        start = {"start": result.states[i].tolist(), "constants": constants}
+        worst.append(result.episode(i) | start | {"replay": command})
+    return worst
+
+
+def _motions(
+    kind: str,
+    numbers: Sequence[int],
+    starts: Any,
+    policy: str,
+    task: str,
+    folder: Path,
+    robot: str,
+    varied: Randomization = Randomization(),
+) -> list[str]:
+    """Runs some of many starts once more, and writes each trajectory to KIND-NUMBER.npz.
+
+    Args:
+        kind: what the files begin with.
+        numbers: of the starts.
+        starts: their states and constants, and with a randomization what was drawn.
+        policy: with `task`, `robot` and `varied`, what runs.
+        folder: of the files.
+
+    Returns:
+        The commands that show them.
+    """
     env = BallbotEnv(task, physics="rk4", robot=robot, randomization=varied)
     controller = make_controller(policy, env.task, env.params)
-    for stale in folder.glob("episode-*.npz"):  # of an earlier evaluation
+    for stale in folder.glob(f"{kind}-*.npz"):  # of an earlier run of the command
         stale.unlink()
-    worst = []
-    for i in result.worst(_WORST):
-        drawn = {"drawn": result.drawn[i]} if varied.varies_episodes else {}
-        options = {"state": result.states[i], "constants": result.constants[i], **drawn}
-        run = rollout(env, controller, seed=0, options=options)
-        path = run.trajectory.save(folder / f"episode-{i}.npz")
-        constants = dict(zip(env.task.constant_names, result.constants[i].tolist(), strict=True))
-        start = {"start": result.states[i].tolist(), "constants": constants}
-        worst.append(result.episode(i) | start | {"replay": shlex.join(["ballbot", "replay", str(path)])})
+    commands = []
+    for i in numbers:
+        drawn = {"drawn": starts.drawn[i]} if varied.varies_episodes else {}
+        options = {"state": starts.states[i], "constants": starts.constants[i], **drawn}
+        path = rollout(env, controller, seed=0, options=options).trajectory.save(folder / f"{kind}-{i}.npz")
+        commands.append(shlex.join(["ballbot", "replay", str(path)]))
     env.close()
-    return worst
+    return commands
 
 
 def _print(result: Any, worst: Sequence[dict[str, Any]]) -> None:

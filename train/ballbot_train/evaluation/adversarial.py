@@ -1,4 +1,4 @@
-"""The worst starts of a policy: a search in the set from which a task draws its episodes.
+"""The worst starts of a policy: a search in the set of all starts of a task.
 
 A policy that fails in none of 10,000 fresh episodes may still fail from some start. An episode is a function of uniform
 random numbers, so each episode is a point of a cube. A search begins at a hard episode. It moves its point by random steps,
@@ -7,16 +7,16 @@ become smaller from round to round.
 """
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ballbot_baselines import find_optima, find_optimum
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import named_robot
+from ballbot_gym.robot import Randomization, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.fresh import FreshResult, numbers_of, priced, run_policy
@@ -27,7 +27,7 @@ with imports_of(__name__):
 
 SEARCHES = 1000
 ROUNDS = 30
-_CONSIDERED = 10  # times as many episodes as searches, of which the hardest are taken
+_CONSIDERED = 10  # times as many episodes as searches; searches begin at the hardest of them
 _LARGEST, _SMALLEST = 0.1, 0.003  # standard deviations of the steps in the unit cube, in the first and the last round
 _TOGETHER = 100  # searches of a task of a worker
 _CHECKED = 2  # of these, how many end with an optimum that was searched for as those of certified episodes are
@@ -39,7 +39,7 @@ class Starts:
     """n episodes of a policy."""
 
     numbers: np.ndarray
-    """(n, k) in [0, 1), from which the task makes an episode."""
+    """(n, k) in [0, 1): the task makes an episode of each row."""
     states: np.ndarray
     """(n, 8) initial states."""
     constants: np.ndarray
@@ -64,14 +64,9 @@ class Starts:
         regrets = np.nan_to_num(self.regrets, nan=-1.0)
         return np.where(self.failure, _FAILED, np.where(self.success, regrets, _MISSED))
 
-    def at(self, chosen: np.ndarray) -> "Starts":
-        """Some of them."""
-        return Starts(**{name: values[chosen] for name, values in asdict(self).items()})
-
-    def and_(self, others: "Starts") -> "Starts":
-        """All of both."""
-        theirs = asdict(others)
-        return Starts(**{name: np.concatenate([values, theirs[name]]) for name, values in asdict(self).items()})
+    def at(self, chosen: Any) -> "Starts":
+        """Some of them, by an index of NumPy."""
+        return Starts(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 def hard_starts(
@@ -86,10 +81,10 @@ def hard_starts(
 
     Args:
         policy: what ran in the fresh episodes; see `fresh.run_policy`.
-        result: the fresh episodes, of a robot from which nothing is hidden.
+        result: the fresh episodes, without a randomization.
         workers: where the episodes run; for more than this process the policy must be a name or a file.
         on_progress: called with a number of finished searches.
-        searches: from how many of the hardest fresh episodes a search begins.
+        searches: how many; each begins at another one of the hardest fresh episodes.
         rounds: how many steps each search tries.
 
     Returns:
@@ -100,36 +95,37 @@ def hard_starts(
             episodes have hidden parameters.
     """
     task = result.task
-    check_searchable(task)
-    if result.randomization.active:
-        raise ValueError(
-            "a search for hard starts needs a robot from which nothing is hidden; leave out --randomization"
-        )
+    check_searchable(task, result.randomization)
 
-    def done(function: Callable[..., Starts], numbers: np.ndarray, *others: Any) -> Starts:
-        """What a function makes of all numbers, some at a time."""
-        chunks = range(0, len(numbers), _TOGETHER)
-        work = ((k, function, (policy, task, result.robot, numbers[k : k + _TOGETHER], *others)) for k in chunks)
+    def done(
+        function: Callable[..., Starts], parts: list[Any], progress: Callable[[int], None], *others: Any
+    ) -> Starts:
+        """What a function makes of all parts."""
+        work = ((k, function, (policy, task, result.robot, part, *others)) for k, part in enumerate(parts))
         found: dict[int, Starts] = {}
-        for k, part in completed(work, workers if len(chunks) > 1 else 1):
-            found[k] = part
-            if others:
-                on_progress(len(part.costs))
-        joined = found[0]
-        for k in chunks[1:]:
-            joined = joined.and_(found[k])
-        return joined
+        for k, made in completed(work, workers if len(parts) > 1 else 1):
+            found[k] = made
+            progress(len(made.costs))
+        return _joined([found[k] for k in range(len(parts))])
 
     expensive = np.argsort(-priced(result.costs, result.success, task), kind="stable")[: _CONSIDERED * searches]
-    began = done(_run, numbers_of(task, expensive, result.seed))
+    numbers = numbers_of(task, expensive, result.seed)
+    began = done(_run, [numbers[chunk] for chunk in _chunks(len(numbers))], lambda count: None)
     began = began.at(np.argsort(-began.hardness, kind="stable")[:searches])
-    ended = done(_search, began.numbers, rounds, result.seed)
+    parts = [began.at(chunk) for chunk in _chunks(len(began.costs))]
+    ended = done(_search, parts, on_progress, rounds, result.seed)
     order = np.argsort(-ended.hardness, kind="stable")
     return began.at(order), ended.at(order)
 
 
-def check_searchable(task: Task) -> None:
-    """Raises a ValueError for a task whose episodes are no functions of uniform numbers."""
+def _chunks(count: int) -> list[slice]:
+    return [slice(k, k + _TOGETHER) for k in range(0, count, _TOGETHER)]
+
+
+def check_searchable(task: Task, randomization: Randomization) -> None:
+    """Raises a ValueError where episodes are no functions of uniform numbers, or have hidden parameters."""
+    if randomization.active:
+        raise ValueError("a search for hard starts needs a robot without hidden parameters; leave out --randomization")
     if type(task).sample is not Task.sample or task.constant_draws + task.state_draws == 0:
         raise ValueError(
             f"{type(task).__name__} does not draw its episodes by draw_constants and draw_state alone, so there is no set "
@@ -137,21 +133,24 @@ def check_searchable(task: Task) -> None:
         )
 
 
-def _search(policy: Any, task: Task, robot: str, numbers: np.ndarray, rounds: int, seed: int) -> Starts:
-    """Where searches from numbers (n, k) end: the same in whichever process they run."""
-    rng = np.random.default_rng([seed, zlib.crc32(numbers.tobytes())])
-    now = _run(policy, task, robot, numbers)
-    n = np.arange(len(numbers))
+def _search(policy: Any, task: Task, robot: str, now: Starts, rounds: int, seed: int) -> Starts:
+    """Where searches from some starts end: the same in whichever process they run."""
+    rng = np.random.default_rng([seed, zlib.crc32(now.numbers.tobytes())])
+    n = np.arange(len(now.costs))
     for step in np.geomspace(_LARGEST, _SMALLEST, rounds):
-        moved = now.numbers + step * rng.standard_normal(numbers.shape)
+        moved = now.numbers + step * rng.standard_normal(now.numbers.shape)
         moved = np.minimum(1 - np.abs(1 - np.abs(moved)), np.nextafter(1.0, 0.0))  # reflected at both ends
         tried = _run(policy, task, robot, moved)
-        now = now.and_(tried).at(n + len(n) * (tried.hardness > now.hardness))
+        now = _joined([now, tried]).at(n + len(n) * (tried.hardness > now.hardness))
     for i in np.argsort(-now.hardness, kind="stable")[:_CHECKED]:
         with suppress(PlanError):
             cost = find_optimum(task, robot, now.states[i], now.constants[i], twice=True).cost
             now.optima[i] = np.fmin(now.optima[i], cost)
     return now
+
+
+def _joined(parts: Sequence[Starts]) -> Starts:
+    return Starts(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 
 def _run(policy: Any, task: Task, robot: str, numbers: np.ndarray) -> Starts:

@@ -13,6 +13,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
@@ -246,14 +247,10 @@ def draw(
         robot: by name.
         randomization: what robots and actuators are drawn from.
     """
-    params, drawn = named_robot(robot), []
+    rng, params, drawn = partial(_rng, task, seed, purpose), named_robot(robot), []
     for i in episodes:
-        hidden = (
-            _rng(task, seed, purpose, i, 1).random(len(Randomization.DRAWN)) if randomization.varies_episodes else ()
-        )
-        z = tuple(map(float, hidden))
-        start = task.sample(_rng(task, seed, purpose, i), params)
-        drawn.append((*start, randomization.draw(z, task.control_dt) if z else ()))
+        z = tuple(rng(i, 1).random(len(Randomization.DRAWN)).tolist()) if randomization.varies_episodes else ()
+        drawn.append((*task.sample(rng(i), params), randomization.draw(z, task.control_dt) if z else ()))
     x, c, robots = map(np.array, zip(*drawn, strict=True))
     return x, c, robots
 

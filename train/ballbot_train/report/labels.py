@@ -17,7 +17,6 @@ _CONTROLLERS = {
     "apg": ("APG", "#8e44ad"),
     "shac": ("SHAC", "#8e44ad"),
     "ppo-scratch": ("PPO from scratch", "#9acd32"),
-    "sac-scratch": ("SAC from scratch", "#5d6d7e"),
 }
 ORDER = [name for name, _ in _CONTROLLERS.values()]
 """Names as figures list them."""
