@@ -271,3 +271,18 @@ def test_last_values_of_many_episodes_at_once_are_those_that_sb3_would_add_one_b
         rewards.append(learner._model.rollout_buffer.rewards)
     assert np.abs(rewards[0]).max() > 1.0  # a last value is many times the pay of a step
     np.testing.assert_allclose(rewards[0], rewards[1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("living", [None, lambda gamma: 1.0])
+def test_a_failure_among_thousands_of_steps_moves_actor_and_critic_about_as_much_as_others_do(
+    living,
+) -> None:
+    env = BallbotEnv(physics="rk4")
+    moved = []
+    for failed in (False, True):
+        buffer = ppo._Rollouts(32, env.observation_space, env.action_space, n_envs=128, living=living)
+        buffer.rewards[:] = np.random.default_rng(0).normal(0.0, 0.1, (32, 128))
+        buffer.rewards[-1, 7] -= 1000.0 * failed
+        buffer.compute_returns_and_advantage(torch.zeros(128), np.zeros(128, bool))
+        moved.append([np.abs(values).max() for values in (buffer.advantages, buffer.returns - buffer.values)])
+    assert all(after < 4 * before for before, after in zip(*moved, strict=True))

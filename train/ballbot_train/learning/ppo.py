@@ -133,19 +133,34 @@ MAX_GRAD_NORM = 1.0
 _WARM_CRITIC_RATE = 1e-3  # learning rate of the critic throughout after a warm start, where the actor's is small
 
 
-class _RelativeRollouts(RolloutBuffer):
-    """A rollout buffer of advantages relative to the cost to go."""
+_LARGEST_ADVANTAGE = (
+    3.0  # the others are clipped to it; in multiples of the size below which 99 % of an iteration's are
+)
 
-    def __init__(self, *args: Any, living: Callable[[float], float], **kwargs: Any):
-        """Args: living: from a discount factor to the value of living indefinitely without cost; the others are SB3's."""
+
+class _Rollouts(RolloutBuffer):
+    """A rollout buffer of clipped advantages, which may be relative to the cost to go.
+
+    A failure costs thirty times what an episode does. When nearly all episodes succeed, one that fails has advantages far
+    beyond all others. They would decide the gradient of their batch, and spoil the critic for dozens of iterations.
+    """
+
+    def __init__(self, *args: Any, living: Callable[[float], float] | None = None, **kwargs: Any):
+        """Args:
+        living: from a discount factor to the value of living indefinitely without cost, where advantages are relative to the
+            cost to go; None where they are not. The other arguments are SB3's.
+        """
         self._living = living
         super().__init__(*args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
         super().compute_returns_and_advantage(last_values, dones)
-        returns, values = torch.as_tensor(self.returns), torch.as_tensor(self.values)
-        relative = (returns - values) / cost_to_go(values, self._living(self.gamma))
-        self.advantages = ((relative - relative.mean()) / (relative.std() + 1e-8)).numpy()
+        limit = _LARGEST_ADVANTAGE * np.quantile(np.abs(self.advantages), 0.99)
+        self.advantages = np.clip(self.advantages, -limit, limit)
+        self.returns = self.values + self.advantages
+        if self._living is not None:
+            relative = self.advantages / cost_to_go(torch.as_tensor(self.values), self._living(self.gamma)).numpy()
+            self.advantages = (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
 _WIDE = 100.0
@@ -262,8 +277,8 @@ class _Ppo(ModelFree):
             clip_range=CLIP_RANGE,
             max_grad_norm=MAX_GRAD_NORM,
             policy_kwargs={"spec": spec},
-            rollout_buffer_class=_RelativeRollouts if config.relative_advantages else None,
-            rollout_buffer_kwargs={"living": self._value_of_living} if config.relative_advantages else None,
+            rollout_buffer_class=_Rollouts,
+            rollout_buffer_kwargs={"living": self._value_of_living if config.relative_advantages else None},
             seed=seed,
             device="cpu",
         )
