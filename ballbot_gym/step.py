@@ -50,6 +50,10 @@ class Outcome(NamedTuple):
     """Index of the first limit that is violated, of `limit_names`; −1 for none."""
 
 
+PAY = ("reward", "cost", "reward_survive", "reward_cost", "reward_goal")
+"""The fields of an `Outcome` that add up over an episode, in the order in which vector envs keep them."""
+
+
 def outcome(
     task: Task, before: Vector, force: Vector, end: Vector, c: Vector, steps: Any, grip: tuple[Any, ...] = ()
 ) -> Outcome:
@@ -77,10 +81,8 @@ def outcome(
     failed = ops.where(failure, ops.full_like(violated, 1.0), 0.0)
     terminated = failed + success if task.first_exit else failed
     ahead = task.survival_reward * task.control_dt * (task.steps - steps)  # pay for the time that remains
-    survive, goal = (
-        task.survival_reward * task.control_dt,
-        ops.where(success > 0, ahead, 0.0) if task.first_exit else 0.0,
-    )
+    survive = ops.full_like(violated, task.survival_reward * task.control_dt)
+    goal = ops.where(success > 0, ahead, 0.0) if task.first_exit else ops.full_like(violated, 0.0)
     price = ops.where(failure, ahead, 0.0)
     if task.goal_reward:
         goal = goal + success * task.goal_reward

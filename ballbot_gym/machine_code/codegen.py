@@ -15,7 +15,7 @@ from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.machine_code.single import StepProblem
 from ballbot_gym.robot import Randomization, Robot
-from ballbot_gym.step import StepState, step
+from ballbot_gym.step import PAY, StepState, step
 from ballbot_gym.tasks import Task
 
 with imports_of("the machine code of batches", "baselines"):
@@ -109,9 +109,6 @@ def source(task: Task, params: Robot, double: bool) -> str:
         "MEASURED": len(params.MEASUREMENTS),
         "GRIP": 4 if params.grips else 0,
         "FLAGS": len(FLAGS),
-        "SURVIVAL_REWARD": float(task.survival_reward * task.control_dt),  # per step
-        "FIRST_EXIT": int(task.first_exit),
-        "PRICED_GOAL": int(task.goal_reward != 0),
         "CONSTANT_DRAWS": task.constant_draws,
         "DRAWS": task.constant_draws + task.state_draws,
     }
@@ -217,7 +214,7 @@ def _advance(
         ("end", did.state.x),
         ("force", did.force),
         ("grip", did.grip),
-        ("pay", (end.reward, end.cost)),
+        ("pay", [getattr(end, name) for name in PAY]),
         ("flags", (end.terminated, end.truncated, end.success, end.failure, did.clipped)),
         ("violated", (end.violated,)),
     )

@@ -12,7 +12,7 @@ __declspec(dllimport) int __stdcall SwitchToThread(void);
 #define YIELD sched_yield
 #endif
 
-/* states, constants, actions and numbers of steps taken -> next states, forces, grip, rewards and costs, flags, violated limit */
+/* states, constants, actions and numbers of steps taken -> next states, forces, grip, pay, flags, violated limit */
 static void advance(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict a, int64_t sa,
                     const real *restrict t, int64_t st, real *restrict end, int64_t send, real *restrict force, int64_t sforce,
                     real *restrict grip, int64_t sgrip, real *restrict pay, int64_t spay, real *restrict flags, int64_t sflags,
@@ -100,9 +100,9 @@ enum { CHUNK = 32 * LANES };
 /* Rows of what is reported of a robot: state, measurements, force, the floor's grip. */
 enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, REPORTED = GRIPPED + GRIP };
 
-/* Rows of flags, which are those of codegen.FLAGS and one more; and of pay. */
+/* Rows of flags, which are those of codegen.FLAGS and one more; and of pay, which are those of step.PAY. */
 enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
-enum { REWARD, COST, SURVIVE, RUNNING, GOAL };
+enum { REWARD, COST, SURVIVE, RUNNING, GOAL, PAYS };
 
 /* Rows of counts: the violated limit, and the steps and the episode of the robot now. */
 enum { VIOLATED, STEPS, EPISODE };
@@ -119,7 +119,7 @@ typedef struct {
     const uint8_t *idle;     /* whose action is ignored, and whose next episode begins; null where there are none */
     int64_t begins, restarts; /* whether episodes begin; and whether they do where others end */
     real *reported, *seen;   /* REPORTED and SEEN rows */
-    double *pay;             /* 5 rows */
+    double *pay;             /* PAYS rows */
     uint8_t *flags;          /* 6 rows */
     int64_t *counts;         /* 3 rows; the last is written where episodes begin, */
     real *new_c;             /* and so is this */
@@ -135,17 +135,9 @@ static inline __attribute__((always_inline)) void write_outcome(const Memory *m,
     double *const pay = m->pay + n;
     uint8_t *const flags = m->flags + n;
     int64_t *const counts = m->counts + n;
-    for (int64_t k = 0; k < count; ++k) {
-        const double reward = paid[k], cost = paid[LANES + k];
-        /* the cost has the price of a failure, or of a goal that is missed, too, and the reward has not */
-        const int priced = limit[k] >= 0 || (PRICED_GOAL && marks[SUCCESS * LANES + k] == 0);
-        const double running = priced ? reward - SURVIVAL_REWARD : -cost;
-        pay[REWARD * B + k] = reward;
-        pay[COST * B + k] = cost;
-        pay[SURVIVE * B + k] = SURVIVAL_REWARD;
-        pay[RUNNING * B + k] = running;
-        pay[GOAL * B + k] = FIRST_EXIT && marks[SUCCESS * LANES + k] != 0 ? reward - SURVIVAL_REWARD - running : 0;
-    }
+    for (int i = 0; i < PAYS; ++i)
+        for (int64_t k = 0; k < count; ++k)
+            pay[i * B + k] = paid[i * LANES + k];
     for (int64_t k = 0; k < count; ++k) {
         counts[VIOLATED * B + k] = (int64_t)limit[k];
         counts[STEPS * B + k] = m->steps[n + k] + 1;
@@ -164,7 +156,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     const int64_t B = m->B;
     const real *const action = m->action + n * m->env;
     real *const reported = m->reported + n;
-    real taken[LANES] = {0}, after[LANES] = {0}, acts[ACTIONS * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
+    real taken[LANES] = {0}, after[LANES] = {0}, acts[ACTIONS * LANES] = {0}, paid[PAYS * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
     for (int64_t k = 0; k < count; ++k) {
         for (int i = 0; i < ACTIONS; ++i)
             acts[i * LANES + k] = action[k * m->env + i * m->component];

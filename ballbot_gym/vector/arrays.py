@@ -11,7 +11,7 @@ import numpy as np
 
 from ballbot_gym import ops, seeding
 from ballbot_gym.robot import Robot
-from ballbot_gym.step import StepState, step
+from ballbot_gym.step import PAY, StepState, step
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.native import FLAG_ROWS, BallbotNative, Computed, State
 
@@ -63,10 +63,9 @@ class BallbotArrays(BallbotNative):
         x, c, a = tuple(old.x), tuple(old.c), tuple(actions.T)
         made = step(task, params, self.randomization, StepState(x, c, old.steps.astype(self.dtype)), a)
         did, end = made.outcome, made.state.x
-        pay = np.empty((5, size))
-        parts = did.reward, did.cost, did.reward_survive, did.reward_cost, did.reward_goal
-        for row, part in zip(pay, parts, strict=True):
-            row[:] = part
+        pay = np.empty((len(PAY), size))
+        for row, name in zip(pay, PAY, strict=True):
+            row[:] = getattr(did, name)
         flags = np.empty((FLAG_ROWS, size), bool)
         for row, part in zip(
             flags, (did.terminated, did.truncated, did.success, did.failure, made.clipped), strict=False

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
     from ballbot_gym.vector.batch import BallbotBatch, BatchStep
 
-_NOTHING_DONE = ("reward", "cost", "terminated", "truncated", "success", "failure", "force", "clipped", "grip")
+_NOTHING_DONE = (
+    *("reward", "reward_parts", "cost", "terminated", "truncated", "success", "failure"),
+    *("force", "clipped", "grip"),
+)
 """Fields of a `BatchStep` that are 0 of an env that waits."""
 
 
@@ -50,21 +53,9 @@ def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -
         state: Any = batch.state
         measured, last_measured = map(batch.measurements, (state, state._replace(x=result.final_x)))
     result = result._make(map(_as_array, result))
-    reward, cost = (part.astype(np.float64, copy=False) for part in (result.reward, result.cost))
+    numbers = result.reward, result.reward_parts, result.cost
+    reward, parts, cost = (number.astype(np.float64, copy=False) for number in numbers)
     ended = (result.terminated | result.truncated).nonzero()[0]
-    parts, survive = np.empty((3, batch.num_envs)), batch.task.survival_reward * batch.task.control_dt
-    parts[0], parts[2] = survive, 0.0
-    np.negative(cost, out=parts[1])
-    if waiting is not None:
-        parts[:, waiting] = 0.0
-    if ended.size:
-        priced = result.violated >= 0
-        if batch.task.goal_reward:
-            priced = priced | ((result.terminated | result.truncated) & ~result.success)
-        failed = np.flatnonzero(priced)
-        parts[1, failed] = reward[failed] - survive  # the cost has the price of what failed too
-        if batch.task.first_exit:
-            parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * result.success[ended]
     seen, last = (part.astype(np.float32, copy=False) for part in (result.observation, result.final_observation))
     violated, end = result.violated, None
     now = cost, parts, result.force, result.success, violated >= 0, result.clipped, result.grip

@@ -69,6 +69,8 @@ class BatchStep(NamedTuple):
     """(B, no) observations. Where an episode ended, the first one of the next episode."""
     reward: torch.Tensor
     """(B,) reward of the step: survival_reward · control_dt minus the running cost, plus the reward at a first exit."""
+    reward_parts: torch.Tensor
+    """(3, B) parts of the reward, which add up to it: for living, for the cost, and at the goal."""
     cost: torch.Tensor
     """(B,) cost of the step, the price of a failure included."""
     terminated: torch.Tensor
@@ -332,6 +334,7 @@ class BallbotBatch:
         result = BatchStep(
             observation=observation,
             reward=did.reward,
+            reward_parts=torch.stack((did.reward_survive, did.reward_cost, did.reward_goal)),
             cost=did.cost,
             terminated=did.terminated,
             truncated=truncated,
