@@ -133,9 +133,7 @@ MAX_GRAD_NORM = 1.0
 _WARM_CRITIC_RATE = 1e-3  # learning rate of the critic throughout after a warm start, where the actor's is small
 
 
-_LARGEST_ADVANTAGE = (
-    3.0  # the others are clipped to it; in multiples of the size below which 99 % of an iteration's are
-)
+_LARGEST_ADVANTAGE = 3.0  # to which others are clipped; in multiples of what 99 % of an iteration's stay below
 
 
 class _Rollouts(RolloutBuffer):
