@@ -5,8 +5,8 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import LqrController, find_optimum
 from ballbot_baselines.feedback.lqr import equilibrium_gain
-from ballbot_baselines.solvers.linearize import discretize, goal_weight, quadratic_cost
-from ballbot_baselines.solvers.riccati import discrete_lqr, tracking_gains
+from ballbot_baselines.solvers.linearize import LinearQuadratic
+from ballbot_baselines.solvers.riccati import Gains, discrete_lqr
 from ballbot_gym import Reference
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -21,12 +21,16 @@ def peak_lean(trajectory):
     return np.degrees(np.abs(trajectory.x[:, 2:4]).max())
 
 
+def at_origin(task, params, points=1):
+    return LinearQuadratic(task, params, np.zeros((points, 8)), np.zeros((points, 2)), NO_CONSTANTS)
+
+
 def step(params, x, u):
     return params.step(x, u, 0.02)
 
 
 def test_weights_are_read_off_the_tasks_cost(params):
-    q, r = quadratic_cost(Stabilize(), HIGH_LEAN[None], NO_FORCE[None], NO_CONSTANTS)
+    q, r = LinearQuadratic(Stabilize(), params, HIGH_LEAN[None], NO_FORCE[None], NO_CONSTANTS).costs
     np.testing.assert_allclose(q[0], np.diag([1, 1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]), atol=1e-12)
     np.testing.assert_allclose(r[0], 5e-4 * np.eye(2), atol=1e-15)
 
@@ -36,7 +40,7 @@ def test_discrete_model_is_the_continuous_ones_exponential(params):
 
     z = 1e-5 * np.eye(10)
     ahead, back = (params.derivative(sign * z[:, :8], sign * z[:, 8:]) for sign in (1, -1))
-    ad, bd = discretize(params, ORIGIN[None], NO_FORCE[None], 0.02)
+    ad, bd = at_origin(Stabilize(control_dt=0.02), params).dynamics
     exact = expm(0.02 * np.block([[(ahead - back).T / 2e-5], [np.zeros((2, 10))]]))
     # RK4 over 10 ms: (7.77·0.01)⁵/120 twice is 5e-8, times rates of up to 60
     np.testing.assert_allclose(ad[0], exact[:8, :8], atol=2e-6)
@@ -45,7 +49,7 @@ def test_discrete_model_is_the_continuous_ones_exponential(params):
 
 def test_step_model_along_a_trajectory_is_the_steps_derivative(params, rng):
     x, u = rng.uniform(-1, 1, (5, 8)), rng.uniform(-200, 200, (5, 2))
-    a, b = discretize(params, x, u, 0.02)
+    a, b = LinearQuadratic(Stabilize(control_dt=0.02), params, x, u, NO_CONSTANTS).dynamics
     h = 1e-6
     for k in range(5):
         columns = [(step(params, x[k] + h * e, u[k]) - step(params, x[k] - h * e, u[k])) / (2 * h) for e in np.eye(8)]
@@ -75,8 +79,9 @@ def test_measured_cost_from_small_states_is_the_riccati_cost(make_env, physics, 
 def test_discrete_lqr_solves_its_riccati_equation_and_is_stable(params):
     task = Stabilize()
     k, p = discrete_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
-    a, b = (m[0] for m in discretize(params, ORIGIN[None], NO_FORCE[None], task.control_dt))
-    q, r = (m[0] * task.control_dt for m in quadratic_cost(task, ORIGIN[None], NO_FORCE[None], NO_CONSTANTS))
+    model = at_origin(task, params)
+    a, b = (m[0] for m in model.dynamics)
+    q, r = (m[0] * task.control_dt for m in model.costs)
     closed = a - b @ k
     np.testing.assert_allclose(q + k.T @ r @ k + closed.T @ p @ closed, p, rtol=1e-8, atol=1e-8)
     assert np.abs(np.linalg.eigvals(closed)).max() < 1
@@ -86,15 +91,15 @@ def test_tracking_gains_along_an_equilibrium_converge_to_lqr(params):
     task = Stabilize()
     k, p = discrete_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
     n = 1000  # 20 s; the slowest closed-loop mode decays below 1e-8 of itself
-    gains = tracking_gains(task, params, np.zeros((n, 8)), np.zeros((n, 2)), NO_CONSTANTS, np.eye(8))
+    gains = Gains.before(np.eye(8), at_origin(task, params, n))
     np.testing.assert_allclose(gains.k[0], k, rtol=1e-6)
     np.testing.assert_allclose(gains.p[0], p, rtol=1e-6, atol=1e-9)
-    from_lqr = tracking_gains(task, params, np.zeros((5, 8)), np.zeros((5, 2)), NO_CONSTANTS, p)
+    from_lqr = Gains.before(p, at_origin(task, params, 5))
     np.testing.assert_allclose(from_lqr.k, np.tile(k, (5, 1, 1)), rtol=1e-8)
 
 
-def test_goal_weight_is_one_per_squared_tolerance():
-    weight = goal_weight(Stabilize(), ORIGIN, NO_CONSTANTS)
+def test_goal_weight_is_one_per_squared_tolerance(params):
+    (weight,) = at_origin(Stabilize(), params).goal_weights
     tolerance = np.array([0.1, 0.1, np.radians(2), np.radians(2), 0.1, 0.1, 0.1, 0.1])
     np.testing.assert_allclose(np.diag(weight), 1 / tolerance**2, rtol=1e-3)  # 1 − cos is quadratic to 1e-4
 

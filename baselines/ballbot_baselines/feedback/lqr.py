@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium, reference_gains
-from ballbot_gym.robot import Robot
+from ballbot_baselines.solvers.linearize import LinearQuadratic
+from ballbot_baselines.solvers.riccati import Gains, discrete_lqr, lqr_at_end
+from ballbot_gym.robot import Robot, substeps_for
 from ballbot_gym.rollout import PlanError
-from ballbot_gym.tasks import Task
+from ballbot_gym.tasks import Reference, Task
+
+_MAX_ROUNDS = 50  # around a closed motion until the Riccati equation is periodic
 
 
 def equilibrium_gain(task: Task, params: Robot) -> tuple[np.ndarray, np.ndarray] | None:
@@ -61,13 +64,21 @@ class LqrController:
         self._start = t
         found = task.reference(x, c, params)
         states, forces = params.extended(found.x, found.u)
-        if len(states) == 1 and not is_equilibrium(params, states[0], forces[0]):
+        # the gains around a closed motion are the same at all times
+        model = LinearQuadratic(task, params, states, forces, c, 0.0 if found.closed else t)
+        if len(states) == 1 and not model.starts_at_rest:
             raise PlanError(
                 f"the reference of {task.id} is one point, at which the robot does not rest; LQR can only hold a robot at "
                 f"rest. Let {type(task).__name__}.reference return a motion, with one point per control step"
             )
-        reference = replace(found, x=states, u=forces)
-        self.reference, self.gains = reference_gains(task, params, reference, c, t)
+        if found.closed:
+            self.gains = _closed_gains(model)
+        else:
+            _, p_final = lqr_at_end(task, params, states[-1], c, t + task.control_dt * len(states))
+            self.gains = Gains.before(p_final, model)
+            if task.clock:
+                forces = forces + _feedforward(model, self.gains)
+        self.reference: Reference = replace(found, x=states, u=forces)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         reference = self.reference
@@ -76,3 +87,35 @@ class LqrController:
         else:
             i = min(round((t - self._start) / self._task.control_dt), len(reference.x) - 1)
         return reference.u[i] - self.gains.k[i] @ (x - reference.x[i])
+
+
+def _closed_gains(model: LinearQuadratic) -> Gains:
+    """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
+    after = np.eye(model.x.shape[1])
+    for _ in range(_MAX_ROUNDS):
+        gains = Gains.before(after, model)
+        if np.allclose(after, gains.p[0], rtol=1e-6):
+            return gains
+        after = gains.p[0]
+    raise PlanError(f"LQR around the closed motion of {model.task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
+
+
+def _feedforward(model: LinearQuadratic, gains: Gains) -> np.ndarray:
+    """(n, 2) forces, N, to add along an open reference that is no motion of the robot, or not the cheapest near it.
+
+    They are the forces of the cheapest motion in the linear model about the reference. LQR's gains are the feedback of the
+    same model. The model includes the errors of the reference in the equations of motion, and the gradients of the cost.
+    """
+    x, u, dt = model.x, model.u, model.task.control_dt
+    (a, b), (_, r), (of_x, of_u) = model.dynamics, model.costs, model.cost_slopes
+    missed = np.zeros_like(x)
+    missed[:-1] = model.params.step(x, u, dt, substeps_for(dt))[:-1] - x[1:]
+    forces = np.zeros_like(u)
+    slope = np.zeros(x.shape[1])  # half the slope of the cost-to-go, which is xᵀPx + 2 slopeᵀx
+    for i in reversed(range(len(x))):
+        after = gains.p[i + 1]
+        slope = slope + after @ missed[i]
+        along = dt * of_u[i] / 2 + b[i].T @ slope
+        forces[i] = -np.linalg.solve(r[i] * dt + b[i].T @ after @ b[i], along)
+        slope = dt * of_x[i] / 2 + a[i].T @ slope - gains.k[i].T @ along
+    return forces

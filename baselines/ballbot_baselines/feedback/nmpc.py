@@ -30,7 +30,7 @@ from ballbot_baselines.feedback.horizon import horizon_qp
 from ballbot_baselines.feedback.tvlqr import TvlqrController
 from ballbot_baselines.optimum.find import plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
-from ballbot_baselines.solvers.linearize import quadratic_cost
+from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.robot import Robot, substeps_for
 from ballbot_gym.rollout import PlanError
@@ -137,7 +137,7 @@ class NmpcController:
         self._tracker = TvlqrController.for_task(task, robot, trajectory, c)
         self._tracker.reset(t, trajectory.x[0], c)
         self._length, self._step = len(trajectory.u), 0
-        q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c, trajectory.t[:-1])
+        q, r = LinearQuadratic(task, robot, trajectory.x[:-1], trajectory.u, c, t).costs
         self._q, self._r = 2 * q, 2 * r * robot.force_limit**2  # Hessians of the cost rate in states and actions
         # of the cost-to-go from each state, whose second derivatives are the tracker's
         self._slopes = plan.slopes

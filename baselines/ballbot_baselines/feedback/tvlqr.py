@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ballbot_baselines.solvers.riccati import Gains, held_steps, lqr_at_end, tracking_gains
+from ballbot_baselines.solvers.linearize import LinearQuadratic
+from ballbot_baselines.solvers.riccati import Gains, lqr_at_end
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -15,19 +16,18 @@ class TvlqrController:
     gain is that of LQR.
     """
 
-    def __init__(self, trajectory: Trajectory, dt: float, gains: Gains, end_gain: np.ndarray | None = None):
+    def __init__(self, model: LinearQuadratic, end: np.ndarray, gains: Gains, end_gain: np.ndarray | None = None):
         """Takes the gains.
 
         Args:
-            trajectory: what to track.
-            dt: s, the control step.
-            gains: for each of the trajectory's n steps.
+            model: of the n control steps to track.
+            end: (8,) state after the last of them.
+            gains: for each of them.
             end_gain: (2, 8) gain after the end; default, the last gain of the trajectory.
         """
-        self.x, self.u = held_steps(trajectory, dt)
-        self.gains = gains
-        self._end, self._end_gain = trajectory.x[-1], gains.k[-1] if end_gain is None else end_gain
-        self._dt, self._start = dt, 0.0
+        self.x, self.u, self.gains = model.x, model.u, gains
+        self._end, self._end_gain = end, gains.k[-1] if end_gain is None else end_gain
+        self._dt, self._start = model.task.control_dt, 0.0
 
     @classmethod
     def for_task(
@@ -42,10 +42,10 @@ class TvlqrController:
 
         Its times are the episode's. `end` is K (2, 8) and P (8, 8) where it ends; default, those of `lqr_at_end`.
         """
-        c, dt = np.asarray(c, np.float64), task.control_dt
-        end_gain, p_final = end or lqr_at_end(task, params, trajectory.x[-1], c, trajectory.t[-1])
-        gains = tracking_gains(task, params, *held_steps(trajectory, dt), c, p_final, trajectory.t[0])
-        return cls(trajectory, dt, gains, end_gain)
+        c, last = np.asarray(c, np.float64), trajectory.x[-1]
+        end_gain, p_final = end or lqr_at_end(task, params, last, c, trajectory.t[-1])
+        model = LinearQuadratic.along(task, params, trajectory, c)
+        return cls(model, last, Gains.before(p_final, model), end_gain)
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._start = t

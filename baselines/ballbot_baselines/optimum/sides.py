@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.solvers.linearize import discretize, quadratic_cost
+from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_gym.tasks import Task
 
 _ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
@@ -86,11 +86,11 @@ def _model(task: Task, params: Any) -> tuple[np.ndarray, np.ndarray]:
     responses divided by √s.
     """
     params = params.ideal()  # with wheels it moves nearly as without
-    dt, rest = task.control_dt, np.zeros((1, 8))
-    a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
+    dt, no_constants = task.control_dt, np.zeros(len(task.constant_names))
+    at_rest = LinearQuadratic(task, params, np.zeros((1, 8)), np.zeros((1, 2)), no_constants)
+    ((a,), (b,)), ((q,), (r,)) = at_rest.dynamics, at_rest.costs
     a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]
-    q, r = quadratic_cost(task, rest, np.zeros((1, 2)), np.zeros(len(task.constant_names)))
-    q, r = q[0][np.ix_(_ACROSS, _ACROSS)] * dt, r[0][1:, 1:] * dt
+    q, r = q[np.ix_(_ACROSS, _ACROSS)] * dt, r[1:, 1:] * dt
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     price = r + b.T @ p @ b
     closed = a - b @ np.linalg.solve(price, b.T @ p @ a)

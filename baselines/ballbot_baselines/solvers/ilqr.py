@@ -24,7 +24,8 @@ import numpy as np
 
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.compiled import LANES, SIMD
-from ballbot_baselines.solvers.riccati import discrete_lqr, is_equilibrium
+from ballbot_baselines.solvers.linearize import LinearQuadratic
+from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_baselines.solvers.shooting import kind_of, ocp_of, symbolic
 from ballbot_gym import machine_code, ops
 from ballbot_gym.machine_code import codegen
@@ -126,7 +127,7 @@ def _rest(task: Task, params: Robot) -> _Rest | None:
     found: list[_Rest] = []
     for x0, c in (task.sample(np.random.default_rng(seed), params) for seed in range(2 if task.constant_names else 1)):
         end = task.reference(x0, c, params)
-        if not end.is_point or not is_equilibrium(params, end.x[0], end.u[0]):
+        if not end.is_point or not LinearQuadratic(task, params, end.x, end.u, c).starts_at_rest:
             return None
         try:
             found.append(_Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))

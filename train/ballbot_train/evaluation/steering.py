@@ -8,8 +8,8 @@ limits that bind, such as the clearance of an obstacle, are not part of it: a mo
 
 import numpy as np
 
-from ballbot_baselines.solvers.linearize import cost_slopes, discretize
-from ballbot_baselines.solvers.riccati import lqr_at_end, tracking_gains
+from ballbot_baselines.solvers.linearize import LinearQuadratic
+from ballbot_baselines.solvers.riccati import Gains, lqr_at_end
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
@@ -31,10 +31,11 @@ def costates(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.
     """
     n, dt = len(action), task.control_dt
     force, before = robot.force_limit * action, x[:-1]
-    a, b = discretize(robot, before, force, dt)
-    along_x, along_u = (dt * slopes for slopes in cost_slopes(task, before, force, c, dt * np.arange(n)))
+    model = LinearQuadratic(task, robot, before, force, c)
+    a, b = model.dynamics
+    along_x, along_u = (dt * slopes for slopes in model.cost_slopes)
     _, final = lqr_at_end(task, robot, x[-1], c, n * dt)
-    k = tracking_gains(task, robot, before, force, c, final).k
+    k = Gains.before(final, model).k
     costate = np.zeros_like(before)
     costate[-1] = _at_end(task, x, force[-1], c)
     for i in reversed(range(1, n)):
