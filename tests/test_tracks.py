@@ -10,10 +10,9 @@ pytest.importorskip("casadi")
 pytest.importorskip("torch")
 
 
-from ballbot_baselines import LqrController
+from ballbot_baselines import VARIANTS, LqrController
 from ballbot_baselines.feedback.adaptive import AdaptiveNmpcController
 from ballbot_baselines.feedback.kalman import TrackFilter
-from ballbot_baselines.feedback.trajopt import cautious_trajopt
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import ROBOT_FACTORS, TRACKS, Randomization, default_params
@@ -204,7 +203,7 @@ def test_noise_alone_keeps_no_robot_from_rest():
 
 def test_cautious_plan_leaves_the_force_that_the_weakest_robot_lacks():
     env = BallbotEnv("stabilize", physics="rk4")
-    cautious = cautious_trajopt(env.task, env.params)
+    cautious = VARIANTS["cautious"](env.task, env.params)
     cautious.reset(0.0, np.array([0, 0, 0.6, 0, 5.0, 0, 1.0, 0]), np.zeros(0))
     asked = np.abs(cautious.plan.trajectory.u).max() / env.params.force_limit
     assert asked == pytest.approx(TRACKS["unknown"].force[0], rel=1e-3)

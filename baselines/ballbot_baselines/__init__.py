@@ -9,14 +9,14 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ballbot_gym.lazy import called, exports, need
-from ballbot_gym.robot import Robot
+from ballbot_gym.robot import TRACKS, Robot
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
     from ballbot_baselines.feedback.kalman import StateFromSensors
     from ballbot_baselines.feedback.lqr import LqrController
-    from ballbot_baselines.feedback.nmpc import NmpcController, offset_free_nmpc
+    from ballbot_baselines.feedback.nmpc import NmpcController
     from ballbot_baselines.feedback.trajopt import TrajoptController
     from ballbot_baselines.feedback.tvlqr import TvlqrController
     from ballbot_baselines.optimum.find import certified_optimum, find_optima, find_optimum, plan_to_track
@@ -28,18 +28,21 @@ if TYPE_CHECKING:
 
 need(__name__, "casadi", "scipy")
 
+_NMPC = called("ballbot_baselines.feedback.nmpc:NmpcController")
+_ADAPTIVE = called("ballbot_baselines.feedback.adaptive:AdaptiveNmpcController")
+_TRAJOPT = called("ballbot_baselines.feedback.trajopt:TrajoptController")
+
 CONTROLLERS: dict[str, Callable[[Task, Robot], Controller]] = {
     "lqr": called("ballbot_baselines.feedback.lqr:LqrController"),
-    "trajopt": called("ballbot_baselines.feedback.trajopt:TrajoptController"),
-    "nmpc": called("ballbot_baselines.feedback.nmpc:NmpcController"),
+    "trajopt": _TRAJOPT,
+    "nmpc": _NMPC,
 }
 """Every controller by its name on the command line. To add a controller to the package, write its file and a line here."""
 
-_ADAPTIVE = called("ballbot_baselines.feedback.adaptive:AdaptiveNmpcController")
 VARIANTS: dict[str, Callable[[Task, Robot], Controller]] = {
     "optimum": called("ballbot_baselines.feedback.trajopt:OptimumController"),
-    "nmpc-offset-free": called("ballbot_baselines.feedback.nmpc:offset_free_nmpc"),
-    "cautious": called("ballbot_baselines.feedback.trajopt:cautious_trajopt"),
+    "nmpc-offset-free": partial(_NMPC, offset_free=True),
+    "cautious": partial(_TRAJOPT, for_robots=TRACKS["unknown"]),
     "nmpc-adaptive": partial(_ADAPTIVE, ending="-adaptive"),
     "nmpc-ekf": partial(_ADAPTIVE, ending="-ekf"),
     "nmpc-adaptive-ekf": partial(_ADAPTIVE, ending="-adaptive-ekf"),
@@ -70,7 +73,6 @@ __all__ = [
     "certified_optimum",
     "find_optima",
     "find_optimum",
-    "offset_free_nmpc",
     "plan_to_track",
     "regret",
 ]
@@ -78,7 +80,7 @@ __all__ = [
 _MODULES = {
     "feedback.kalman": ("StateFromSensors",),
     "feedback.lqr": ("LqrController",),
-    "feedback.nmpc": ("NmpcController", "offset_free_nmpc"),
+    "feedback.nmpc": ("NmpcController",),
     "feedback.trajopt": ("TrajoptController",),
     "feedback.tvlqr": ("TvlqrController",),
     "optimum.find": ("certified_optimum", "find_optima", "find_optimum", "plan_to_track"),

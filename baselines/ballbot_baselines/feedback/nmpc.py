@@ -83,7 +83,7 @@ class NmpcController:
         nodes: int | None = None,
         horizon: float | None = None,
         iterations: int = 1,
-        backoff: Backoff = BACKOFF,
+        backoff: Backoff | None = None,
         offset_free: bool = False,
     ):
         """Builds the program; `reset` does the planning.
@@ -93,13 +93,15 @@ class NmpcController:
                 limited, because the optimal forces then change from step to step along the friction cone.
             horizon: s, a whole number of control steps; default 1 s, or 20 control steps if these are longer.
             iterations: largest number of iterations per control step: 1 is the real-time iteration; about 20 converge.
-            backoff: distance of the plan from its limits; within the horizon, margins keep half of it.
+            backoff: distance of the plan from its limits; within the horizon, margins keep half of it. Default, `BACKOFF`,
+                or more if `offset_free`.
             offset_free: whether to estimate how the robot's accelerations differ from the model's, and to correct the model.
 
         Raises:
             ValueError: the horizon is not a whole number of control steps, or has fewer than 2.
         """
-        self._task, self._params, self.backoff = task, params, backoff
+        self._task, self._params = task, params
+        self.backoff = backoff or (_OFFSET_FREE_BACKOFF if offset_free else BACKOFF)
         self._iterations, self._offset_free = iterations, offset_free
         if horizon is None:
             horizon = max(1.0, _FEWEST * task.control_dt)
@@ -263,8 +265,3 @@ def _grid(steps: int, nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     held = np.repeat(np.eye(nodes), lengths, axis=0)  # (steps, N)
     later = np.vstack([held[1:], np.zeros((1, nodes))])
     return offsets, of_states, np.add.reduceat(later, offsets[:-1], axis=0) / lengths[:, None]
-
-
-def offset_free_nmpc(task: Task, params: Robot) -> NmpcController:
-    """NMPC that estimates how the robot differs from the model, and keeps more distance from its limits."""
-    return NmpcController(task, params, backoff=_OFFSET_FREE_BACKOFF, offset_free=True)

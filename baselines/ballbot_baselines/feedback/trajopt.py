@@ -1,21 +1,22 @@
 """Trajectory optimization as a controller: plan at reset, track with TVLQR."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ballbot_baselines.feedback.tvlqr import TvlqrController
 from ballbot_baselines.optimum.find import certified_optimum, plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.shooting import Backoff
-from ballbot_gym.robot import TRACKS, Robot
+from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
 
 EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02, grip=0.1)
 """How far plans for execution stay from their limits: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the
 force, a tenth of the weight in normal force, where friction is limited."""
 
-_LEAST_FORCE, _LEAST_FRICTION = TRACKS["unknown"].force[0], TRACKS["unknown"].friction[0]
 # A robot that differs from the model misses its plan: half of the goal's tolerance and 3 cm are left for that.
-_CAUTIOUS = Backoff(margin=0.03, goal=0.5, force=1 - _LEAST_FORCE, grip=0.1)
+_CAUTIOUS = Backoff(margin=0.03, goal=0.5, grip=0.1)
 
 
 class TrajoptController:
@@ -25,7 +26,19 @@ class TrajoptController:
     raises a PlanError if it finds no plan.
     """
 
-    def __init__(self, task: Task, params: Robot, backoff: Backoff = EXECUTED):
+    def __init__(self, task: Task, params: Robot, backoff: Backoff = EXECUTED, for_robots: Randomization | None = None):
+        """Takes the model.
+
+        Args:
+            task: the problem.
+            params: the robot.
+            backoff: distance of the plan from its limits.
+            for_robots: if given, the plan is one for `params` with the least friction of these robots, and its back-off is
+                as large as all of them need: their least force is enough for the plan.
+        """
+        if for_robots is not None:
+            params = params.varied(friction=for_robots.friction[0])
+            backoff = replace(_CAUTIOUS, force=1 - for_robots.force[0])
         self._task, self._params, self._backoff = task, params, backoff
         self.plan: Optimum | None = None
 
@@ -53,11 +66,3 @@ class OptimumController(TrajoptController):
     def _planned(self, t: float, x: np.ndarray, c: np.ndarray) -> Optimum:
         known = certified_optimum(self._task, self._params, x, c) if t == 0 else None
         return known or super()._planned(t, x, c)
-
-
-def cautious_trajopt(task: Task, params: Robot) -> TrajoptController:
-    """`TrajoptController` for the nominal robot with the least force and friction of the track "unknown".
-
-    Its plans leave enough force for feedback, and enough distance from the limits, on all robots of that track.
-    """
-    return TrajoptController(task, params.varied(friction=_LEAST_FRICTION), _CAUTIOUS)
