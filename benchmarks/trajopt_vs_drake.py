@@ -20,7 +20,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import SnoptSolver
 
-from ballbot_baselines.paper.collocation import Problem, hermite_simpson, solve
+from ballbot_baselines.paper.collocation import Problem
 from ballbot_baselines.paper.problems import PAPER_PROBLEMS
 from ballbot_baselines.solvers.ocp import OcpSolver
 from ballbot_gym import files
@@ -82,13 +82,13 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
 def time_ours(problem: Problem, params: Robot, guess: Trajectory, repeats: int) -> tuple[float, ...]:
     """Cost, and seconds to build, to solve from the guess, and to solve again from the solution."""
     start = time.perf_counter()
-    OcpSolver(hermite_simpson(problem, params), problem.intervals, "fatrop")
+    OcpSolver(problem.hermite_simpson(params), problem.intervals, "fatrop")
     built = time.perf_counter() - start
     try:
-        plans = [solve(problem, params, guess, "fatrop") for _ in range(repeats)]
+        plans = [problem.solve(params, guess, "fatrop") for _ in range(repeats)]
     except PlanError:
         return np.nan, built, np.nan, np.nan
-    warm = [solve(problem, params, plans[0].trajectory, "fatrop").seconds for _ in range(repeats)]
+    warm = [problem.solve(params, plans[0].trajectory, "fatrop").seconds for _ in range(repeats)]
     return plans[0].cost, built, float(np.median([plan.seconds for plan in plans])), float(np.median(warm))
 
 
@@ -144,7 +144,7 @@ def time_compilation(params: Robot) -> float:
         os.environ["BALLBOT_CACHE"] = folder
         for _ in range(2):  # with an empty cache, then with a full one
             start = time.perf_counter()
-            OcpSolver(hermite_simpson(problem, params), problem.intervals, "fatrop")
+            OcpSolver(problem.hermite_simpson(params), problem.intervals, "fatrop")
             seconds.append(time.perf_counter() - start)
     if kept is None:
         del os.environ["BALLBOT_CACHE"]

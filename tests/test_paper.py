@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("casadi")
 
 from ballbot_baselines.paper import problems
-from ballbot_baselines.paper.collocation import collocation_error, solve
+from ballbot_baselines.paper.collocation import collocation_error
 from ballbot_baselines.paper.problems import PAPER_PROBLEMS, between_states
 from ballbot_baselines.solvers import guess as guesses
 from ballbot_gym.rollout import PlanError
@@ -129,7 +129,7 @@ def test_collocation_error_shrinks_as_knots_are_added(plan_of, params):
         x0, x1 = entry.problem.initial[0], entry.problem.final[0]
         times = np.linspace(0, coarse.trajectory.duration, 81)
         x, u = (np.array([read(t) for t in times]) for read in (coarse.trajectory.state, coarse.trajectory.force))
-        fine = solve(between_states(name, x0, x1, intervals=80), params, Trajectory(times, x, u))
+        fine = between_states(name, x0, x1, intervals=80).solve(params, Trajectory(times, x, u))
         # measured: 4.8, 5 and 3.0 (where forces jump, less is gained)
         fine_error, coarse_error = (collocation_error(params, each.trajectory) for each in (fine, coarse))
         assert fine_error < coarse_error / factor
@@ -155,15 +155,16 @@ def test_problem_without_a_solution_raises_with_status_and_violation(params, sol
     entry = PAPER_PROBLEMS["stabilize-5"]
     hurried = replace(entry.problem, name="hurried", step=(0.005, 0.01))  # 0.4 s to stop from 5 m/s
     with pytest.raises(PlanError, match=rf"hurried: {solver} found no plan: \w+.*violated by \d\.\de[+-]\d\d"):
-        solve(hurried, params, entry.guess(params), solver, max_iterations=60)
+        hurried.solve(params, entry.guess(params), solver, max_iterations=60)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_start_beyond_the_lean_limit_raises_a_plan_error(params, solver):
     entry = PAPER_PROBLEMS["stabilize-1"]
     x0 = entry.problem.initial[0] + [0, 0, 1.2, 0, 0, 0, 0, 0]  # the limit is 1
+    leaning = replace(entry.problem, name="leaning", initial=(x0, x0))
     with pytest.raises(PlanError, match="leaning"):
-        solve(replace(entry.problem, name="leaning", initial=(x0, x0)), params, entry.guess(params), solver)
+        leaning.solve(params, entry.guess(params), solver)
 
 
 def test_guess_along_an_accelerating_path_is_the_motion_itself(params):

@@ -29,6 +29,10 @@ from ballbot_gym.trajectory import Trajectory
 
 _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
 
+# Where things stand in the staged state s = [x, u/limit, h, q, x_start]. Only periodic problems have an x_start. Inputs are
+# the next [x, u/limit] from the leans on.
+_X, _A, _INPUTS, _H = slice(0, 8), slice(8, 10), slice(2, 10), 10
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -55,102 +59,93 @@ class Problem:
     inequalities: Callable[[Any, Any, Any], tuple] | None = None
     """(x, u, q) -> each ≥ 0, at all knots."""
 
+    def hermite_simpson(self, params: Ballbot) -> Ocp:
+        """The staged problem whose dynamics and equality constraints are Hermite–Simpson's."""
+        q, limit = self._free, params.force_limit
+        start = slice(q.stop, q.stop + 8 * self.periodic)
 
-# Where things stand in the staged state s = [x, u/limit, h, q, x_start]. Only periodic problems have an x_start. Inputs are
-# the next [x, u/limit] from the leans on.
-_X, _A, _INPUTS, _H = slice(0, 8), slice(8, 10), slice(2, 10), 10
+        def interval(s: casadi.SX, w: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+            """The next [x, u/limit], and the defects of its components from the leans on."""
+            x0, u0, h, x1, u1 = s[_X], limit * s[_A], s[_H], casadi.vertcat(0, 0, w[:6]), limit * w[6:]
+            f0, f1 = params.derivative(x0, u0), params.derivative(x1, u1)
+            middle = 0.5 * (x0 + x1) + h / 8 * (f0 - f1)
+            f_middle = params.derivative(middle, 0.5 * (u0 + u1))
+            reached = x0 + h / 6 * (f0 + 4 * f_middle + f1)
+            return casadi.vertcat(reached[:2], w), w[:6] - reached[2:]
 
+        def path(function: Callable | None, s: casadi.SX) -> casadi.SX:
+            return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[_X], limit * s[_A], s[q]))
 
-def _free(problem: Problem) -> slice:
-    """Where the free variables q stand."""
-    return slice(_H + 1, _H + 1 + len(problem.free))
+        def inequalities(s: casadi.SX) -> casadi.SX:
+            asked = path(self.inequalities, s)
+            return casadi.vertcat(asked, *params.limits(s[_X], limit * s[_A])) if params.grips else asked
 
-
-def hermite_simpson(problem: Problem, params: Ballbot) -> Ocp:
-    """The staged problem whose dynamics and equality constraints are Hermite–Simpson's."""
-    q, limit = _free(problem), params.force_limit
-    start = slice(q.stop, q.stop + 8 * problem.periodic)
-
-    def interval(s: casadi.SX, w: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
-        """The next [x, u/limit], and the defects of its components from the leans on."""
-        x0, u0, h, x1, u1 = s[_X], limit * s[_A], s[_H], casadi.vertcat(0, 0, w[:6]), limit * w[6:]
-        f0, f1 = params.derivative(x0, u0), params.derivative(x1, u1)
-        middle = 0.5 * (x0 + x1) + h / 8 * (f0 - f1)
-        f_middle = params.derivative(middle, 0.5 * (u0 + u1))
-        reached = x0 + h / 6 * (f0 + 4 * f_middle + f1)
-        return casadi.vertcat(reached[:2], w), w[:6] - reached[2:]
-
-    def path(function: Callable | None, s: casadi.SX) -> casadi.SX:
-        return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[_X], limit * s[_A], s[q]))
-
-    def inequalities(s: casadi.SX) -> casadi.SX:
-        asked = path(problem.inequalities, s)
-        return casadi.vertcat(asked, *params.limits(s[_X], limit * s[_A])) if params.grips else asked
-
-    ocp = Ocp(
-        name="hermite-simpson",
-        states=start.stop,
-        inputs=8,
-        params=0,
-        next=lambda s, w, p: casadi.vertcat(interval(s, w)[0], s[_H:]),
-        cost=lambda s, w, p: problem.cost(s[_X], limit * s[_A], s[_H], s[q]),
-        equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(problem.equalities, s)),
-        inequalities=lambda s, w, p: inequalities(s),
-        final_inequalities=lambda s, p: inequalities(s),
-    )
-    if not problem.periodic:
-        return ocp
-    initial = np.zeros((8, start.stop))  # x_start is x_0
-    initial[:, _X], initial[:, start] = np.eye(8), -np.eye(8)
-    return replace(ocp, final_equalities=lambda s, p: s[_X] - s[start], initial_matrix=initial)
-
-
-def solve(
-    problem: Problem, params: Ballbot, guess: Trajectory, solver: str = "ipopt", max_iterations: int = 500
-) -> Optimum:
-    """Solves a problem from a guess, which should be roughly a motion: its N+1 knots, at equal times, with linear forces.
-
-    The optimum's trajectory has linear forces and cubic states. From a straight line between two states the solvers take up
-    to 12 times as many iterations, or stop at an infeasible point.
-
-    Raises:
-        PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
-    """
-    n, ocp = problem.intervals, hermite_simpson(problem, params)
-    bounds = _bounds(problem, ocp)
-    knots = np.column_stack([guess.x, guess.u / params.force_limit])
-    start = guess.x[0] if problem.periodic else ()
-    constant = np.tile([guess.t[1] - guess.t[0], *(value for _, _, value in problem.free), *start], (n + 1, 1))
-    optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
-    started = time.perf_counter()
-    result = optimizer.solve(np.hstack([knots, constant]), knots[1:, _INPUTS], *bounds)
-    seconds = time.perf_counter() - started
-    converged = result.success or result.status == ACCEPTABLE
-    if not (converged and result.is_within_limits):
-        raise PlanError(
-            f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
-            f"violated by {result.violation:.1e}. Try another guess or more time."
+        ocp = Ocp(
+            name="hermite-simpson",
+            states=start.stop,
+            inputs=8,
+            params=0,
+            next=lambda s, w, p: casadi.vertcat(interval(s, w)[0], s[_H:]),
+            cost=lambda s, w, p: self.cost(s[_X], limit * s[_A], s[_H], s[q]),
+            equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(self.equalities, s)),
+            inequalities=lambda s, w, p: inequalities(s),
+            final_inequalities=lambda s, p: inequalities(s),
         )
-    return _optimum(params, result, seconds)
+        if not self.periodic:
+            return ocp
+        initial = np.zeros((8, start.stop))  # x_start is x_0
+        initial[:, _X], initial[:, start] = np.eye(8), -np.eye(8)
+        return replace(ocp, final_equalities=lambda s, p: s[_X] - s[start], initial_matrix=initial)
 
+    def solve(self, params: Ballbot, guess: Trajectory, solver: str = "ipopt", max_iterations: int = 500) -> Optimum:
+        """Solves the problem from a guess, which should be roughly a motion: its N+1 knots, at equal times, with linear
+        forces.
 
-def _bounds(problem: Problem, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
-    lower, upper = ocp.no_bounds(problem.intervals)
-    lower[:, 2:4], upper[:, 2:4] = -problem.lean_limit, problem.lean_limit
-    lower[:, _A], upper[:, _A] = -1, 1
-    for knot, (low, high) in ((0, problem.initial), (-1, problem.final)):
-        lower[knot, _X] = np.maximum(lower[knot, _X], low)
-        upper[knot, _X] = np.minimum(upper[knot, _X], high)
-    # h and q do not change, so bounds at the first knot suffice.
-    lower[0, _H], upper[0, _H] = problem.step
-    for i, (low, high, _) in enumerate(problem.free):
-        lower[0, _H + 1 + i], upper[0, _H + 1 + i] = low, high
-    for knot, i in np.argwhere(lower > upper)[:1]:
-        name, low, high = Ballbot.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
-        raise PlanError(
-            f"{problem.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
-        )
-    return lower, upper
+        The optimum's trajectory has linear forces and cubic states. From a straight line between two states the solvers take
+        up to 12 times as many iterations, or stop at an infeasible point.
+
+        Raises:
+            PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
+        """
+        n, ocp = self.intervals, self.hermite_simpson(params)
+        bounds = self._bounds(ocp)
+        knots = np.column_stack([guess.x, guess.u / params.force_limit])
+        start = guess.x[0] if self.periodic else ()
+        constant = np.tile([guess.t[1] - guess.t[0], *(value for _, _, value in self.free), *start], (n + 1, 1))
+        optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
+        started = time.perf_counter()
+        result = optimizer.solve(np.hstack([knots, constant]), knots[1:, _INPUTS], *bounds)
+        seconds = time.perf_counter() - started
+        converged = result.success or result.status == ACCEPTABLE
+        if not (converged and result.is_within_limits):
+            raise PlanError(
+                f"{self.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
+                f"violated by {result.violation:.1e}. Try another guess or more time."
+            )
+        return _optimum(params, result, seconds)
+
+    def _bounds(self, ocp: Ocp) -> tuple[np.ndarray, np.ndarray]:
+        lower, upper = ocp.no_bounds(self.intervals)
+        lower[:, 2:4], upper[:, 2:4] = -self.lean_limit, self.lean_limit
+        lower[:, _A], upper[:, _A] = -1, 1
+        for knot, (low, high) in ((0, self.initial), (-1, self.final)):
+            lower[knot, _X] = np.maximum(lower[knot, _X], low)
+            upper[knot, _X] = np.minimum(upper[knot, _X], high)
+        # h and q do not change, so bounds at the first knot suffice.
+        lower[0, _H], upper[0, _H] = self.step
+        for i, (low, high, _) in enumerate(self.free):
+            lower[0, _H + 1 + i], upper[0, _H + 1 + i] = low, high
+        for knot, i in np.argwhere(lower > upper)[:1]:
+            name, low, high = Ballbot.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
+            raise PlanError(
+                f"{self.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
+            )
+        return lower, upper
+
+    @property
+    def _free(self) -> slice:
+        """Where the free variables q stand in a staged state."""
+        return slice(_H + 1, _H + 1 + len(self.free))
 
 
 def _optimum(params: Ballbot, result: Solution, seconds: float) -> Optimum:

@@ -15,7 +15,7 @@ from ballbot_baselines.feedback.lqr import LqrController
 from ballbot_baselines.feedback.trajopt import TrajoptController
 from ballbot_baselines.feedback.tvlqr import TvlqrController
 from ballbot_baselines.optimum.optimum import Optimum
-from ballbot_baselines.paper.collocation import Problem, solve
+from ballbot_baselines.paper.collocation import Problem
 from ballbot_baselines.solvers.guess import along_path
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import ops
@@ -61,7 +61,7 @@ class PaperProblem:
         Raises:
             PlanError: the solver stopped without it.
         """
-        return solve(self.problem, params, self.guess(params), solver)
+        return self.problem.solve(params, self.guess(params), solver)
 
     def compare(self) -> dict[str, Episode]:
         """Episodes of LQR and of trajectory optimization in PyBullet, both with Stabilize's weights, as in the paper's
