@@ -5,13 +5,13 @@ Where there are more control steps than nodes, the later intervals hold theirs l
 """
 
 from functools import lru_cache
+from typing import Any
 
 import casadi
 import numpy as np
 
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
 from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
-from ballbot_baselines.solvers.shooting import symbolic
 from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.tasks import Task
 
@@ -225,8 +225,8 @@ def _stage_function(task: Task, kind: Kind) -> casadi.Function:
     x, a = casadi.SX.sym("x", len(kind.robot.STATE)), casadi.SX.sym("a", len(kind.robot.ACTION))
     p = casadi.SX.sym("p", 1 + len(kind.numbers))
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
-    robot, limit = symbolic(kind, p)
-    z, u, h = casadi.vertcat(x, a), limit * a, p[0]
+    robot: Any = kind.model(p[1:])
+    z, u, h = casadi.vertcat(x, a), robot.force_limit * a, p[0]
     after = robot.step(x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))
     outputs = [

@@ -31,7 +31,7 @@ from ballbot_baselines.optimum.random_guesses import Recovery
 from ballbot_baselines.solvers import guess, righting
 from ballbot_baselines.solvers.compiled import LANES
 from ballbot_baselines.solvers.ilqr import MARGIN, Motions, Options, ilqr
-from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
+from ballbot_baselines.solvers.shooting import FREE_TIME_INTERVALS, Backoff, Shooting
 from ballbot_gym import machine_code
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
@@ -217,7 +217,7 @@ class _Batch:
         LQR's cost-to-go is added if `steps` control steps end before the episode does.
         """
         c = (self._c if c is None else c)[of]
-        _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
+        _, *given = Shooting(self._task, self._params, self._x0[0], c[0], self._backoff).parameters()
         rows = np.tile(given, (len(c), 1))
         first = len(self._params.numbers())
         rows[:, first : first + c.shape[1]] = c

@@ -19,8 +19,9 @@ import casadi
 import numpy as np
 
 from ballbot_baselines.solvers import righting
+from ballbot_baselines.solvers.formulas import check_formulas
 from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
-from ballbot_baselines.solvers.shooting import Backoff, kind_of, ocp_of, shooting_parameters
+from ballbot_baselines.solvers.shooting import Backoff, Shooting, ocp_of
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
@@ -46,7 +47,7 @@ def largest_leans(task: Task, params: Robot, component: int, values: np.ndarray)
         (n,) rad; NaN where no recoverable lean was found. The search goes outward from the value nearest 0. It starts from
         the neighbouring value's solution and from a recovery to the side, and if both fail from standing.
     """
-    p = shooting_parameters(task, params, np.zeros(0), Backoff(0.0, 0.0, 0.0, 0.0))
+    p = Shooting(task, params, np.zeros(8), np.zeros(0), Backoff(0.0, 0.0, 0.0, 0.0)).parameters()
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
     middle = int(np.argmin(np.abs(values)))
@@ -89,7 +90,8 @@ def _sideways(task: Task, params: Robot) -> tuple[np.ndarray, np.ndarray] | None
 
 def _largest_lean_ocp(task: Task, params: Robot) -> Ocp:
     """The task's problem with a free initial lean. The ninth state carries that lean to the end, where it is the reward."""
-    fixed = ocp_of(*kind_of(task, params))
+    check_formulas(task, params)
+    fixed = ocp_of(task, params.kind)
     price = _REGULARIZATION * task.control_dt
     same = np.zeros((1, 9))
     same[0, _LEAN], same[0, 8] = 1.0, -1.0

@@ -6,7 +6,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ballbot_gym.robot import Robot
+from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.tasks import Task
 
 _SEGMENTS, _POINTS = 32, 401  # straight lines through states near starts, and points of each
@@ -17,13 +17,21 @@ _ADVICE = (
     "or math"
 )
 
+_checked: set[tuple[Task, Kind]] = set()
+
 
 def check_formulas(task: Task, params: Robot) -> None:
-    """Checks cost, margins and goal of a task near some of its starts.
+    """Checks cost, margins and goal of a task near some of its starts, once for every kind of robot.
 
     Raises:
         ValueError: a method cannot be differentiated by CasADi, jumps, has a kink, or is not finite, or a cost is negative.
     """
+    if (task, params.kind) not in _checked:
+        _check(task, params)
+        _checked.add((task, params.kind))
+
+
+def _check(task: Task, params: Robot) -> None:
     rng = np.random.default_rng(0)
     starts = [task.sample(rng, params) for _ in range(_SEGMENTS)]
     x = np.stack([x for x, _ in starts])

@@ -24,9 +24,10 @@ import numpy as np
 
 from ballbot_baselines.solvers import righting
 from ballbot_baselines.solvers.compiled import LANES, SIMD
+from ballbot_baselines.solvers.formulas import check_formulas
 from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_baselines.solvers.riccati import discrete_lqr
-from ballbot_baselines.solvers.shooting import kind_of, ocp_of, symbolic
+from ballbot_baselines.solvers.shooting import ocp_of
 from ballbot_gym import machine_code, ops
 from ballbot_gym.machine_code import codegen
 from ballbot_gym.robot import Kind, Robot, substeps_for
@@ -157,9 +158,9 @@ class _Ilqr:
                 f"the search of many optima at once does not support {type(params).__name__}, see Robot.BATCHED_OPTIMA; "
                 "find_optimum solves its episodes one by one"
             )
-        kind = kind_of(task, params)  # which refuses formulas that cannot be optimized
+        check_formulas(task, params)
         self._limit, self.rest = params.force_limit, None if free_time else _rest(task, params)
-        library, self._sizes = _compiled(*kind, free_time, self.rest is not None)
+        library, self._sizes = _compiled(task, params.kind, free_time, self.rest is not None)
         self.states = self._sizes["STATES"]
         self._solve, self._follow = library.solve, library.follow
         of_all = [ctypes.c_int64, ctypes.c_int64, ctypes.c_double]
@@ -257,8 +258,8 @@ class _Stage:
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
         self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
         self._all = casadi.vertcat(self._x[8] if free_time else self._dt, self._p[: self._ocp.params - 1])
-        self._limit: Any
-        self._robot, self._limit = symbolic(kind, self._all)
+        self._robot: Any = kind.model(self._all[1 : 1 + len(kind.numbers)])
+        self._limit = self._robot.force_limit
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
         path, end = (

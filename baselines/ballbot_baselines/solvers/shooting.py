@@ -31,7 +31,6 @@ FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
 
 _MOST_ITERATIONS = 200
-_checked: set[tuple[Task, Kind]] = set()
 
 
 @dataclass(frozen=True)
@@ -67,35 +66,21 @@ class Backoff:
         return Backoff(**{name: min(value, max(share * value, least[name])) for name, value in asdict(self).items()})
 
 
-def kind_of(task: Task, params: Robot) -> tuple[Task, Kind]:
-    """What problems are made for: a task, and a kind of robot.
-
-    Raises:
-        ValueError: no optimizer can use the task's formulas; see `check_formulas`.
-    """
-    kind = task, params.kind
-    if kind not in _checked:
-        check_formulas(task, params)
-        _checked.add(kind)
-    return kind
-
-
-def symbolic(kind: Kind, p: casadi.SX) -> tuple[Any, casadi.SX]:
-    """A robot of a kind, whose numbers stand in p after the length of a step, and its force limit."""
-    model = kind.model(p[1 : 1 + len(kind.numbers)])
-    return model, model.force_limit
-
-
 @lru_cache(maxsize=64)
 def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
     """A task on its env's discretization, or with forces held longer than its control steps.
 
-    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, then the
+    Inputs are actions, force / limit; `Shooting.parameters` gives p. How long forces are held comes first in it, then the
     numbers of the robot. So problems on fine and coarse grids and of all robots of a kind share all compiled functions, and
     all tasks share those of the dynamics. With `free_time` one length of all intervals, s, is the last state.
     """
     n, nc, first = len(kind.robot.STATE), len(task.constant_names), 1 + len(kind.numbers)
     margin, goal, reserve = range(first + nc, first + nc + 3)  # back-offs in p
+
+    def robot_of(p: casadi.SX) -> tuple[Any, casadi.SX]:
+        """The robot, and its force limit."""
+        robot = kind.model(p[1:first])
+        return robot, robot.force_limit
 
     def of_stage(s: casadi.SX, p: casadi.SX) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
         """State, length of the interval, and constants, with the stage's time if the task has a clock."""
@@ -109,7 +94,7 @@ def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
     def path(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not kind.grips:
             return margins(s, p)
-        robot, limit = symbolic(kind, p)
+        robot, limit = robot_of(p)
         return casadi.vertcat(margins(s, p), *robot.limits(s[:n], limit * a, p[reserve], p[0]))
 
     def final(s: casadi.SX, p: casadi.SX) -> casadi.SX:
@@ -120,15 +105,15 @@ def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
         return casadi.vertcat(margins(s, p), (1 - p[goal]) ** 2 - 1 - casadi.vertcat(*task.goal(x, c)))
 
     def after(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, _), (robot, limit) = of_stage(s, p), symbolic(kind, p)
+        (x, length, _), (robot, limit) = of_stage(s, p), robot_of(p)
         return casadi.vertcat(robot.step(x, limit * a, length, substeps), s[n:])
 
     def rates(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, _), (robot, limit) = of_stage(s, p), symbolic(kind, p)
+        (x, length, _), (robot, limit) = of_stage(s, p), robot_of(p)
         return casadi.vertcat(length * robot.derivative(x, limit * a), casadi.SX.zeros(int(free_time)))
 
     def cost(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, c), (_, limit) = of_stage(s, p), symbolic(kind, p)
+        (x, length, c), (_, limit) = of_stage(s, p), robot_of(p)
         return task.cost(x, limit * a, c) * length
 
     substeps = 2 if free_time else substeps_for(task.control_dt)
@@ -147,17 +132,6 @@ def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
     )
 
 
-def shooting_parameters(
-    task: Task, params: Robot, c: np.ndarray, backoff: Backoff, coarseness: int = 1, start: float = 0.0
-) -> list[float]:
-    """p of `ocp_of`: s that forces are held, `Robot.numbers`, c, back-offs from margins and goal, of grip if friction
-    is limited, and the episode's time at the start, s, if the task has a clock.
-    """
-    reserve = [backoff.grip] if params.grips else []
-    numbers, clock = params.numbers(), [start] if task.clock else []
-    return [task.control_dt * coarseness, *numbers, *c, backoff.margin, backoff.goal, *reserve, *clock]
-
-
 @lru_cache(maxsize=256)
 def _solver(task: Task, kind: Kind, free_time: bool, *options: Any) -> OcpSolver:
     return OcpSolver(ocp_of(task, kind, free_time), *options)
@@ -174,6 +148,15 @@ class Shooting:
     backoff: Backoff
     start: float = 0.0
     """The episode's time at x0, s."""
+
+    def parameters(self, coarseness: int = 1) -> list[float]:
+        """p of `ocp_of`: s that forces are held, `Robot.numbers`, c, back-offs from margins and goal, of grip if friction
+        is limited, and the episode's time at the start, s, if the task has a clock.
+        """
+        params, backoff = self.params, self.backoff
+        reserve, clock = [backoff.grip] if params.grips else [], [self.start] if self.task.clock else []
+        held = self.task.control_dt * coarseness
+        return [held, *params.numbers(), *self.c, backoff.margin, backoff.goal, *reserve, *clock]
 
     def along(self, path: np.ndarray, length: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """A guess that roughly follows a ground path (n+1, 2), m, one point every `length` s; default, the control step."""
@@ -200,20 +183,23 @@ class Shooting:
             barrier: of the first iterate.
             iterations: after which it gives up.
             tolerance: of the solver; default, the finest that it reaches.
+
+        Raises:
+            ValueError: no optimizer can use the task's formulas; see `check_formulas`.
         """
         n, known, force, dt = len(a), self.params.state_size, self.backoff.force, self.task.control_dt
         free_time = x.shape[1] > known
         # On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits.
         tolerance = tolerance or (1e-6 if self.params.grips else 1e-8)
-        made = _solver(*kind_of(self.task, self.params), free_time, n, solver, tolerance, iterations, barrier)
+        check_formulas(self.task, self.params)
+        made = _solver(self.task, self.params.kind, free_time, n, solver, tolerance, iterations, barrier)
         lower, upper = made.ocp.no_bounds(n)
         lower[0, :known] = upper[0, :known] = self.x0
         lower[:, x.shape[1] :], upper[:, x.shape[1] :] = force - 1, 1 - force
         if free_time:
             longest = self.task.duration / n
             lower[:, known], upper[:, known] = min(dt / 4, longest), longest
-        p = shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness, self.start)
-        return made.solve(x, a, lower, upper, p)
+        return made.solve(x, a, lower, upper, self.parameters(coarseness))
 
     def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[Solution]:
         """From a guess by fatrop, and if that fails by ipopt: all solutions, the best last.
