@@ -24,10 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ballbot_baselines.optimum import random_guesses, sides
+from ballbot_baselines.optimum import sides
 from ballbot_baselines.optimum.guesses import BASIN_DOUBT, COARSE, CONSIDERED, contenders, side_doubt, straight_path
 from ballbot_baselines.optimum.optimum import Optimum
-from ballbot_baselines.optimum.random_guesses import Recovery
+from ballbot_baselines.optimum.random_guesses import RandomGuesses, Recovery
 from ballbot_baselines.solvers import guess, righting
 from ballbot_baselines.solvers.compiled import LANES
 from ballbot_baselines.solvers.ilqr import MARGIN, Motions, Options, ilqr
@@ -486,7 +486,7 @@ class _Batch:
     def _search_randomly(self, guesses: int, enough: float) -> np.ndarray:
         """Keeps the cheapest solutions from random guesses; returns costs (guesses, B), as `search` does."""
         count = len(self._x0)
-        rngs = [random_guesses.generator(x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
+        random = [RandomGuesses(x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
         costs = np.full((guesses, count), np.inf)
         if guesses:
             self._known = self._known_motions()
@@ -497,7 +497,7 @@ class _Batch:
             recovering = (number % 3 == 0) & self._ends_at_a_point & (not self.is_slalom)
             for rows, search in ((recovering, self._recover_randomly), (~recovering, self._detour)):
                 if rows.any():
-                    costs[number[rows], of[rows]] = search(of[rows], rngs)
+                    costs[number[rows], of[rows]] = search(of[rows], random)
         return costs
 
     def _known_motions(self) -> dict[int, _Known]:
@@ -508,23 +508,21 @@ class _Batch:
         rough = self._solve(self._along(list(paths), list(paths.values()), COARSE), _SIDES, COARSE)
         return {i: _Known(path, cost) for (i, path), cost in zip(paths.items(), rough.costs.tolist(), strict=True)}
 
-    def _recover_randomly(self, of: np.ndarray, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+    def _recover_randomly(self, of: np.ndarray, random: Sequence[RandomGuesses]) -> np.ndarray:
         """(J,) costs from a random recovery of each of some episodes."""
-        tried = [self._recovered(np.array([i]), random_guesses.recovery(rngs[i])) for i in of]
+        tried = [self._recovered(np.array([i]), random[i].recovery()) for i in of]
         x, a, costs = (np.concatenate(part) for part in zip(*tried, strict=True))
         survived = np.isfinite(costs)
         guesses = Motions.guessed(of, np.full(len(of), self._recovery_steps), x, a)
         costs[survived] = self._keep(guesses.some(survived), _MOTION)
         return costs
 
-    def _detour(self, of: np.ndarray, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+    def _detour(self, of: np.ndarray, random: Sequence[RandomGuesses]) -> np.ndarray:
         """(J,) costs along a random detour of each of some episodes, of its best known motion or of a guessed path."""
         task, paths = self._task, []
         for i in of.tolist():
-            bases = self._guessed_paths[i]
-            if i in self._known and rngs[i].uniform() < 0.5:
-                bases = [self._known[i].path]
-            paths.append(random_guesses.detour(bases[rngs[i].integers(len(bases))], rngs[i], task.first_exit))
+            known = self._known[i].path if i in self._known else None
+            paths.append(random[i].detour(self._guessed_paths[i], known, task.first_exit))
         if task.first_exit:
             return self._arrive(of.tolist(), paths)
         if not self.is_slalom:

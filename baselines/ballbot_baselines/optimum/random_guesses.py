@@ -26,20 +26,27 @@ class Recovery(NamedTuple):
     """Time constant with which this lean fades, s."""
 
 
-def generator(x0: np.ndarray, c: np.ndarray) -> np.random.Generator:
-    """Random numbers for the episode from x0 with constants c."""
-    return np.random.default_rng(np.frombuffer(x0.tobytes() + c.tobytes(), np.uint32))
+class RandomGuesses:
+    """The random guesses of the episode from x0 (8,) with constants c (nc,), one after the other."""
 
+    def __init__(self, x0: np.ndarray, c: np.ndarray):
+        self._rng = np.random.default_rng(np.frombuffer(x0.tobytes() + c.tobytes(), np.uint32))
 
-def recovery(rng: np.random.Generator) -> Recovery:
-    """A random recovery."""
-    return Recovery(rng.uniform(6, 15), rng.uniform(0.8, 2.2), rng.normal(scale=0.3), rng.uniform(0.2, 1.5))
+    def recovery(self) -> Recovery:
+        """A random recovery."""
+        rng = self._rng
+        return Recovery(rng.uniform(6, 15), rng.uniform(0.8, 2.2), rng.normal(scale=0.3), rng.uniform(0.2, 1.5))
 
+    def detour(self, paths: list[np.ndarray], known: np.ndarray | None, first_exit: bool) -> np.ndarray:
+        """A ground path (n+1, 2), m, with random bumps between its ends. With `first_exit` its length is random, too.
 
-def detour(path: np.ndarray, rng: np.random.Generator, first_exit: bool) -> np.ndarray:
-    """A ground path (n+1, 2), m, with random bumps between its ends. With `first_exit` its length is random, too."""
-    s = np.linspace(0, 1, len(path))[:, None] ** rng.uniform(0.3, 1)  # bumps lie nearer to the start
-    scale = _SMALLEST * (_LARGEST / _SMALLEST) ** rng.uniform()
-    bumps = [np.sin(k * np.pi * s) * rng.normal(scale=scale / k, size=2) for k in _BUMPS]
-    path = path + np.sum(bumps, axis=0)
-    return guess.resampled(path, max(2, round((len(path) - 1) * rng.uniform(0.6, 1.6)))) if first_exit else path
+        It is one of some paths, or in half of all cases that of a motion that is known.
+        """
+        rng = self._rng
+        bases = paths if known is None or rng.uniform() >= 0.5 else [known]
+        path = bases[rng.integers(len(bases))]
+        s = np.linspace(0, 1, len(path))[:, None] ** rng.uniform(0.3, 1)  # bumps lie nearer to the start
+        scale = _SMALLEST * (_LARGEST / _SMALLEST) ** rng.uniform()
+        bumps = [np.sin(k * np.pi * s) * rng.normal(scale=scale / k, size=2) for k in _BUMPS]
+        path = path + np.sum(bumps, axis=0)
+        return guess.resampled(path, max(2, round((len(path) - 1) * rng.uniform(0.6, 1.6)))) if first_exit else path
