@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ballbot_baselines.optimum import sides
-from ballbot_baselines.optimum.guesses import BASIN_DOUBT, COARSE, CONSIDERED, contenders, side_doubt, straight_path
+from ballbot_baselines.optimum.guesses import BASIN_DOUBT, COARSE, CONSIDERED, contenders, straight_path
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.optimum.random_guesses import RandomGuesses, Recovery
 from ballbot_baselines.solvers import guess, righting
@@ -438,7 +438,6 @@ class _Batch:
         free = self._solve(self._along(every.tolist(), straight, coarse), _ROUGH_PATH, coarse, c=away)
         along = guess.resampled(free.x[..., :1], task.steps)[..., 0]
         goal_y = np.array([straight_one[-1, 1] for straight_one in straight])
-        doubt = side_doubt(params)
         likely: dict[int, dict[int, np.ndarray]] = {}  # choices by the steps that are optimized, and by episode
         counts = np.where(free.solved, [len(each) for each in self._obstacles], 0)
         for count in np.unique(counts[counts > 0]):
@@ -452,7 +451,7 @@ class _Batch:
                 steps = np.minimum(steps, np.ceil(after / shared).astype(int) * shared)
             for i, prices, last in zip(rows.tolist(), predicted, steps.tolist(), strict=True):
                 order = np.argsort(prices, kind="stable")
-                chosen = order[prices[order] <= prices.min() * (1 + doubt)]
+                chosen = order[prices[order] <= prices.min() * (1 + found.doubt)]
                 likely.setdefault(last, {})[i] = found.sides[chosen]
         for steps, choices in likely.items():
             self._pass_obstacles(choices, steps)

@@ -19,15 +19,7 @@ COARSE = 2
 """Control steps per interval when several guesses are compared."""
 BASIN_DOUBT = 0.01
 """Paths whose coarse costs differ by less than this share may be ordered differently on the env's grid."""
-GRIPPING_DOUBT = 0.02
-"""The same of choices of sides, for robots that have to grip, because predictions ignore friction."""
-_SIDE_DOUBT = 0.01
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
-
-
-def side_doubt(params: Any) -> float:
-    """Choices of sides whose predicted cost exceeds the best by more than this share are not solved."""
-    return GRIPPING_DOUBT if params.grips else _SIDE_DOUBT
 
 
 def straight_path(task: Task, params: Any, x0: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -15,9 +15,7 @@ from ballbot_baselines.optimum.guesses import (
     ALL_GUESSES,
     BASIN_DOUBT,
     COARSE,
-    GRIPPING_DOUBT,
     contenders,
-    side_doubt,
     straight_path,
 )
 from ballbot_baselines.solvers import guess, righting
@@ -183,10 +181,10 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     there is no motion without obstacles, nothing is solved.
     """
     task, params, x0, c = episode.task, episode.params, episode.x0, episode.c
-    iterations, grid_doubt, doubt = _QUICK_ITERATIONS, _GRID_DOUBT, side_doubt(params)
+    iterations, grid_doubt = _QUICK_ITERATIONS, _GRID_DOUBT
     coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else COARSE), _ROUGH
     if params.grips:
-        iterations, grid_doubt = _GRIPPING_ITERATIONS, GRIPPING_DOUBT
+        iterations, grid_doubt = _GRIPPING_ITERATIONS, sides.GRIPPING_DOUBT
         coarsest, tolerance = COARSE, None
 
     def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> Solution:
@@ -205,7 +203,7 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     solved: list[Solution] = []
     least = math.inf  # that was predicted of a choice that is solved
     for i in np.argsort(predicted, kind="stable")[:most].tolist():
-        if predicted[i] > least * (1 + doubt):
+        if predicted[i] > least * (1 + prediction.doubt):
             break
         motion = np.column_stack([motion[:, 0], across[i]])
         for start, barrier in ((motion, NEAR_BARRIER), (motion, BARRIER), (paths[i], BARRIER)):

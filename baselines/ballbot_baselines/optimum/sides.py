@@ -24,6 +24,9 @@ import scipy.linalg
 from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_gym.tasks import Task
 
+GRIPPING_DOUBT = 0.02
+"""`_Prediction.doubt` of robots that have to grip, because predictions ignore friction."""
+_DOUBT = 0.01
 _ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
 _REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same control step
 
@@ -40,6 +43,7 @@ class _Prediction:
     | free | (B, steps+1) | the ground position across the way without obstacles, m |
     | pushes | (B, 2^n, n) | multipliers of the obstacles, positive to the left |
     | responses | (steps+1, steps) | the position's response to forces, divided by √s |
+    | doubt | | a choice whose predicted cost exceeds the lowest by more than this share need not be solved |
     """
 
     sides: np.ndarray
@@ -48,6 +52,7 @@ class _Prediction:
     free: np.ndarray
     pushes: np.ndarray
     responses: np.ndarray
+    doubt: float
 
     def y(self, slalom: int) -> np.ndarray:
         """(2^n, steps+1) the ground position across the way in one slalom, m."""
@@ -77,7 +82,8 @@ def predict(
     matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
     prices = _prices(matrices.reshape(-1, n, n), least.reshape(-1, n)).reshape(least.shape)
     costs = np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
-    return _Prediction(sides, costs, passed, free, sides * prices, responses)
+    doubt = GRIPPING_DOUBT if params.grips else _DOUBT
+    return _Prediction(sides, costs, passed, free, sides * prices, responses, doubt)
 
 
 @lru_cache(maxsize=8)
