@@ -4,8 +4,7 @@ Importing this module is light: CasADi is imported when an optimum is computed.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from ballbot_gym import certified
@@ -83,8 +82,6 @@ def compute(
         ValueError: a method of the task gives what no optimizer can use; the message names it.
     """
     needed = list(dict.fromkeys(episodes))
-    for index in needed:
-        _check_start(task, params, index)
     folder = cache.folder(task, params, randomization)
     jobs.make_folder(folder)
     lock = filelock.FileLock(folder / "computing.lock")
@@ -100,14 +97,13 @@ def compute(
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as advance:
-            from ballbot_baselines.optimum.certification import AT_ONCE, entries
+            from ballbot_baselines.optimum.certification import AT_ONCE
 
-            solve = partial(entries, task, robot=params, randomization=randomization)
             each = min(AT_ONCE, -(-len(missing) // _TASKS))
             parts = (missing[k : k + each] for k in range(0, len(missing), each))
-            work = ((part, _solved, (solve, part)) for part in parts)
+            work = ((part, _solved, (task, params, part, randomization)) for part in parts)
             solved = (
-                [solve(missing)]
+                [_solve(task, params, missing, randomization)]
                 if Workers.of(workers).here == 1
                 else (entries for _, entries in completed(work, workers))
             )
@@ -136,5 +132,21 @@ def _check_start(task: Task, params: Robot, index: int) -> None:
     check_paths(task, params, x, c, where)
 
 
-def _solved(solve: Callable[[list[int]], Iterator[Any]], part: list[int]) -> list[Any]:
-    return list(solve(part))
+def _solve(
+    task: Task, params: Robot, episodes: list[int], randomization: Randomization
+) -> Iterator[tuple[int, certified.EvaluationSet | str]]:
+    """`certification.entries` of some episodes. Starts are checked just before they are solved, because that takes a while
+    for thousands of them.
+    """
+    from ballbot_baselines.optimum.certification import entries
+
+    def checked() -> Iterator[int]:
+        for index in episodes:
+            _check_start(task, params, index)
+            yield index
+
+    return entries(task, checked(), params, randomization)
+
+
+def _solved(*problem: Any) -> list[tuple[int, certified.EvaluationSet | str]]:
+    return list(_solve(*problem))
