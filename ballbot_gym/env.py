@@ -31,11 +31,11 @@ from ballbot_gym.robot import (
     PAPER,
     Randomization,
     Robot,
+    Sensors,
     checked_randomization,
     checked_robot,
     named_robot,
     own_fields,
-    sensors,
 )
 from ballbot_gym.step import (
     ENGINE,
@@ -82,7 +82,7 @@ class EnvState(NamedTuple):
     past: tuple[float, ...] = ()
     """What is observed of the present, and of the past behind it, where the env has a history."""
     sensors: tuple[float, ...] = ()
-    """What sensors remember, where they are what is observed; see `sensors.MEMORY`."""
+    """What sensors remember, where they are what is observed; see `Sensors.MEMORY`."""
 
 
 class TaskEnv:
@@ -236,7 +236,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._varies = self.randomization.varies_episodes
         self._draws = Draws(
             (0.0,) * (Randomization.PUSH_DRAWS * self.randomization.pushes),
-            (0.0,) * (sensors.DRAWS * self._senses),
+            (0.0,) * (Sensors.DRAWS * self._senses),
             (0.0,) * (Randomization.NOISE_DRAWS * self.randomization.is_noisy),
         )
         self._random = any(self._draws)

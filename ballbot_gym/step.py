@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.robot import Randomization, Robot, needed_friction, sensors
+from ballbot_gym.robot import Randomization, Robot, Sensors, needed_friction
 from ballbot_gym.tasks.base import Task
 
 _LARGEST_OBSERVED = 1e6  # far beyond what any episode shows
@@ -115,7 +115,7 @@ class StepState(NamedTuple):
     actuator: tuple[Any, ...] = ()
     """What the actuator remembers; see `Randomization.actuate`."""
     sensors: tuple[Any, ...] = ()
-    """What sensors remember, where they are what is observed; see `sensors.MEMORY`."""
+    """What sensors remember, where they are what is observed; see `Sensors.MEMORY`."""
 
 
 class Draws(NamedTuple):
@@ -222,7 +222,7 @@ def step(
     did = outcome(task, state.x, force, end, state.c, state.steps + 1, kept)
     read = state.sensors
     if read:
-        read = sensors.following(model, read, state.x, total, end, z.sensors, task.control_dt)
+        read = Sensors(model, task.control_dt).following(read, state.x, total, end, z.sensors)
     largest = action[0] * action[0]
     for part in action[1:]:
         largest = ops.maximum(largest, part * part)
@@ -233,7 +233,7 @@ def step(
 def start_draws(task: Task, variation: Randomization, senses: bool) -> int:
     """Uniform numbers that `start` takes."""
     varied = variation.episode_draws * variation.active
-    return task.constant_draws + task.state_draws + varied + sensors.FIRST_DRAWS * senses
+    return task.constant_draws + task.state_draws + varied + Sensors.FIRST_DRAWS * senses
 
 
 def start(
@@ -271,7 +271,7 @@ def start(
     read = ()
     if senses:
         model = variation.robot(robot, drawn) if variation.varies_robot else robot
-        read = sensors.first(model, x, z[-sensors.FIRST_DRAWS :], task.control_dt)
+        read = Sensors(model, task.control_dt).first(x, z[-Sensors.FIRST_DRAWS :])
     return StepState(x, c, zero, drawn, actuator, read)
 
 
@@ -288,7 +288,7 @@ def observe(task: Task, robot: Any, variation: Randomization, state: StepState, 
     time = state.steps * task.control_dt
     c = task.at(state.c, time)
     if state.sensors:
-        return sensors.seen(state.sensors, c)
+        return Sensors.seen(state.sensors, c)
     x = variation.sensed(state.x, noise, state.drawn, time) if variation.is_noisy else state.x
     return ops.components(task.seen(x, c, robot))
 

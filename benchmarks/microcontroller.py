@@ -17,7 +17,7 @@ import tyro
 
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robot import PAPER, ROBOTS, named_robot, sensors
+from ballbot_gym.robot import PAPER, ROBOTS, Sensors, named_robot
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_train.evaluation.controllers import make_controller, policy_path, split
 from ballbot_train.policy.export_c import LQR, export_c
@@ -217,7 +217,7 @@ class _Recorded:
         """As the C file takes it: of sensors in SI units."""
         if not self.senses:
             return x.astype(np.float32)
-        return np.append((x[:9] * sensors.SCALE).astype(np.float32) / np.array(sensors.SCALE), x[9:])
+        return np.append((x[:9] * Sensors.SCALE).astype(np.float32) / np.array(Sensors.SCALE), x[9:])
 
 
 def _episode(task: str, robot: str, name: str, filtered: bool) -> dict[str, str]:
@@ -228,7 +228,7 @@ def _episode(task: str, robot: str, name: str, filtered: bool) -> dict[str, str]
     c = rollout(env, controller, seed=1).constants.astype(np.float32)
     shown, place = np.array(controller.shown), np.zeros(2)
     if filtered:
-        shown, place = shown[:, :9] * sensors.SCALE, shown[0, 9:11]
+        shown, place = shown[:, :9] * Sensors.SCALE, shown[0, 9:11]
     actions = np.clip(np.array(controller.forces) / params.force_limit, -1, 1)
     arrays = {"constants": np.append(c, 0), "shown": shown, "place": place, "actions": actions}
     return {key: ", ".join(c_number(value) for value in array.ravel()) for key, array in arrays.items()}

@@ -105,7 +105,7 @@ def test_with_ideal_motors_and_yaw_held_it_is_the_robot_without_wheels(robot, rn
         x = np.concatenate([x[:9], np.zeros(2)])
         u = ideal.turning_ball(x, force[:2])
         # without the last two equations, because something else holds the body's yaw and the ball's spin
-        matrix, right = (np.array(part, float) for part in omni.equations(ideal, x, u))
+        matrix, right = (np.array(part, float) for part in ideal.equations(x, u))
         expected = rolling.accelerations(x[:8], force[:2])
         np.testing.assert_allclose(np.linalg.solve(matrix[:4, :4], right[:4]), expected, rtol=0, atol=1e-9)
 
@@ -113,10 +113,10 @@ def test_with_ideal_motors_and_yaw_held_it_is_the_robot_without_wheels(robot, rn
 def test_energy_changes_by_the_power_of_motors_and_friction(robot, rng):
     x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
     rate = casadi.jtimes(robot.energy(x), x, robot.derivative(x, u))
-    w, _ = omni.relative_turning(robot, x)
-    pull, drag = omni.torque(robot.ball_radius, u, x[8]), robot.wheels.drag(robot.force_limit) * robot.ball_radius**2
+    w, _ = robot.relative_turning(x)
+    pull, drag = robot.torque(u, x[8]), robot.wheels.drag(robot.force_limit) * robot.ball_radius**2
     lost = drag * (omni.ACROSS * (w[0] ** 2 + w[1] ** 2) + omni.ALONG * w[2] ** 2)
-    power = sum(a * b for a, b in zip(pull, w, strict=True)) - lost + omni.floor_torque(robot.wheels, x[10]) * x[10]
+    power = sum(a * b for a, b in zip(pull, w, strict=True)) - lost + robot.wheels.floor_torque(x[10]) * x[10]
     function = casadi.Function("powers", [x, u], [rate, power])
     for state, force in random_states(rng):
         found, expected = map(float, function(state, force))

@@ -8,7 +8,7 @@ import pytest
 from ballbot_baselines import StateFromSensors
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robot import TRACKS, named_robot, omni, sensors
+from ballbot_gym.robot import TRACKS, Sensors, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_train.evaluation.controllers import controllers_of, make_controller
 from ballbot_train.evaluation.evaluate import evaluate
@@ -38,7 +38,7 @@ def body(x):
 
 
 def test_standing_still_only_gravity_is_measured(robot):
-    read = sensors.ideal(robot, (0.0,) * 11, (0.0,) * 3)
+    read = robot.readings((0.0,) * 11, (0.0,) * 3)
     np.testing.assert_allclose(read, [0, 0, 0, 0, 0, robot.gravity, 0, 0, 0], atol=1e-12)
 
 
@@ -55,24 +55,24 @@ def test_the_gyroscope_measures_how_the_body_turns_and_the_accelerometer_how_its
         x = np.array(x)
         turning = body(x).T @ rate(body, x, u)
         force = body(x).T @ (rate(speed, x, u) + [0, 0, robot.gravity])
-        found = sensors.ideal(robot, tuple(x), u)
+        found = robot.readings(tuple(x), u)
         np.testing.assert_allclose(found[:3], [turning[2, 1], turning[0, 2], turning[1, 0]], rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(found[3:6], force, rtol=1e-4, atol=1e-3)
 
 
 def test_wheels_turn_as_their_power_says(robot, rng):
     x, u, _ = random_motion(robot, rng)
-    w, _ = omni.relative_turning(robot, x)
-    speeds = np.array(sensors.ideal(robot, x, u)[6:])
-    assert robot.wheels.radius * speeds @ u == pytest.approx(np.dot(omni.torque(robot.ball_radius, u, x[8]), w))
+    w, _ = robot.relative_turning(x)
+    speeds = np.array(robot.readings(x, u)[6:])
+    assert robot.wheels.radius * speeds @ u == pytest.approx(np.dot(robot.torque(u, x[8]), w))
 
 
 def test_readings_are_means_over_the_control_step(robot, rng):
     x, u, after = random_motion(robot, rng)
-    read, fine, parts = sensors.mean(robot, x, u, after, DT), x, []
+    read, fine, parts = Sensors(robot, DT).mean(x, u, after), x, []
     for _ in range(20):
         later = robot.step(fine, u, DT / 20)
-        parts.append(sensors.mean(robot, fine, u, later, DT / 20))
+        parts.append(Sensors(robot, DT / 20).mean(fine, u, later))
         fine = later
     expected = np.array(parts)
     expected = [*expected[:, :6].mean(0), *expected[:, 6:].sum(0)]
@@ -88,9 +88,9 @@ def test_encoders_forget_nothing_of_a_turn(robot):
     for _ in range(10):
         seen, *_, info = env.step([0.1, -0.05, -0.05])
         after = tuple(info["state"])
-        turned += sensors.mean(robot, x, tuple(info["force"]), after, DT)[6:]
+        turned += Sensors(robot, DT).mean(x, tuple(info["force"]), after)[6:]
         counted, x = counted + seen[6:9], after
-    assert np.abs(counted - turned).max() < 2 * sensors.TICK
+    assert np.abs(counted - turned).max() < 2 * Sensors.TICK
 
 
 def test_a_copy_goes_on_with_the_same_readings():
@@ -110,7 +110,7 @@ def test_batches_measure_what_single_envs_do(monkeypatch):
     from ballbot_gym.vector import BallbotVectorEnv
 
     for name in ("GYROSCOPE_NOISE", "GYROSCOPE_BIAS", "ACCELEROMETER_NOISE"):
-        monkeypatch.setattr(sensors, name, 0.0)
+        monkeypatch.setattr(Sensors, name, 0.0)
     given = {"task": "turn", "robot": "omni", "observation": "sensors", "history": 1}
     vector = BallbotVectorEnv(2, dtype=torch.float64, **given)
     many, infos = vector.reset(seed=0)

@@ -10,7 +10,7 @@ from typing import Any
 
 from ballbot_gym.engines.bullet_client import import_pybullet
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State
-from ballbot_gym.robot import Omni, PointBall, RollingBall, omni, urdf_text
+from ballbot_gym.robot import Omni, PointBall, RollingBall, urdf_text
 
 _JOINTS = ("x", "y", "gamma", "theta", "psi")  # the last where wheels turn the body
 _loading = threading.Lock()
@@ -251,8 +251,8 @@ class _BulletOmniSimulator(_BulletContactSimulator):
         bullet, client, robot, wheels = self._bullet, self._client, self._robot, self._params.wheels
         x, turning = self._state()
         for _ in range(self._steps):
-            tx, ty, tz = omni.torque_on_ball(self._params, x, turning, u)
-            brake = omni.floor_torque(wheels, turning[2])
+            tx, ty, tz = self._params.torque_on_ball(x, turning, u)
+            brake = wheels.floor_torque(turning[2])
             bullet.applyExternalTorque(robot, self._ball, (tx, ty, tz + brake), bullet.WORLD_FRAME, client)
             bullet.applyExternalTorque(robot, self._joints[4], (-tx, -ty, -tz), bullet.WORLD_FRAME, client)
             bullet.stepSimulation(client)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import Omni, PointBall, RollingBall, omni
+from ballbot_gym.robot import Omni, PointBall, RollingBall
 
 _PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
 _ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo requires a mass of every moving body
@@ -244,7 +244,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         turn, wheels = np.empty(9), self._params.wheels
         self._mujoco.mju_quat2Mat(turn, self._positions[6:])
         spin = float(turn[6:] @ self._velocities[6:])
-        self._model.actuator_biasprm[3, 2] = omni.floor_torque(wheels, spin) / spin if spin else 0.0
+        self._model.actuator_biasprm[3, 2] = wheels.floor_torque(spin) / spin if spin else 0.0
         return spin
 
     def _twist(self, torque: np.ndarray) -> None:
@@ -253,7 +253,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
 
     def _rotor_torque(self) -> np.ndarray:
         """(3,) N·m, of the rotors on the ball, by the acceleration under all torques that are applied now."""
-        mujoco, model, data, wheels = self._mujoco, self._model, self._data, self._params.wheels
+        mujoco, model, data = self._mujoco, self._model, self._data
         mujoco.mj_forward(model, data)
         mujoco.mj_rnePostConstraint(model, data)
         spins, accelerations = data.cvel[:, :3], data.cacc[:, :3]
@@ -261,8 +261,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         (a, b, c), (p, q, r) = spins[_BODY].tolist(), spins[_BALL].tolist()
         relative = accelerations[_BALL] - accelerations[_BODY] - (b * r - c * q, c * p - a * r, a * q - b * p)
         axis = data.xmat[_BODY].reshape(3, 3)[:, 2]
-        felt = omni.ACROSS * relative + (omni.ALONG - omni.ACROSS) * (axis @ relative) * axis
-        return -wheels.mass * self._params.ball_radius**2 * felt
+        return self._params.rotor_torque(relative, axis)
 
     def _describe(self, spec: Any) -> None:
         super()._describe(spec)
@@ -272,7 +271,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         for name, place in (("body", body), ("ball", ball), ("floor", spec.worldbody)):
             place.add_site(name=f"on_{name}")
         drag = wheels.drag(robot.force_limit)
-        units = [omni.torque(robot.ball_radius, tuple(unit)) for unit in np.eye(3).tolist()]
+        units = [robot.torque(tuple(unit)) for unit in np.eye(3).tolist()]
         for turning, damping, other in (*((unit, drag, "body") for unit in units), ((0, 0, 1), 0, "floor")):
             spec.add_actuator(
                 target="on_ball",

@@ -17,7 +17,7 @@ import numpy as np
 
 from ballbot_gym import machine_code
 from ballbot_gym.machine_code.libraries import NoMachineCodeError, shipped_source
-from ballbot_gym.robot import Kind, Randomization, Robot, first_of_kind, named_robot, sensors
+from ballbot_gym.robot import Kind, Randomization, Robot, Sensors, first_of_kind, named_robot
 from ballbot_gym.step import Draws, Outcome, Step, StepState, by_engine, closed_form, observation_size, observe, step
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import digest, problem_digest
@@ -62,10 +62,10 @@ class StepProblem(NamedTuple):
             "x": states,
             "steps": 1,
             "actuator": len(variation.resting((0.0,) * actions, self.task.control_dt)),
-            "sensors": sensors.MEMORY * self.senses,
+            "sensors": Sensors.MEMORY * self.senses,
             "action": actions,
             "push": variation.PUSH_DRAWS * variation.pushes,
-            "read": sensors.DRAWS * self.senses,
+            "read": Sensors.DRAWS * self.senses,
             "noise": variation.NOISE_DRAWS * variation.is_noisy,
             "end": states * engine,
             "floor": 3 * self.contact,

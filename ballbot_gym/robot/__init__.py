@@ -35,6 +35,7 @@ from ballbot_gym.robot.registry import (
     short_name,
 )
 from ballbot_gym.robot.rolling_ball import RollingBall
+from ballbot_gym.robot.sensors import Sensors
 from ballbot_gym.robot.shapes import Cylinder, Shape, Sphere
 from ballbot_gym.robot.urdf import (
     OMNI_URDF_PATH,
@@ -68,6 +69,7 @@ __all__ = [
     "Registered",
     "Robot",
     "RollingBall",
+    "Sensors",
     "Shape",
     "Sphere",
     "UrdfError",

@@ -91,6 +91,10 @@ class Wheels:
         """d, N·s/m: by how much a wheel's pull falls per speed of its surface, of a motor with this pull at standstill, N."""
         return force_limit / (self.radius * self.no_load_speed) + self.damping / self.radius**2
 
+    def floor_torque(self, spin: Any) -> Any:
+        """Of the floor on a ball that spins about the vertical, rad/s: N·m."""
+        return -self.spin_friction * spin / ops.sqrt(spin * spin + _SPIN_SPEED**2)
+
     @property
     def mass(self) -> float:
         """m, kg: the inertia as felt at the wheel's surface."""
@@ -157,7 +161,7 @@ class Omni(RollingBall):
 
     def accelerations(self, x: Vector, u: Vector) -> tuple[Any, ...]:
         """(ẍ, ÿ, γ̈, θ̈, ψ̈, ω̇_z) in m/s² and rad/s² for state x (..., 11) and the wheels' forces u (..., 3), N."""
-        return solved(*equations(self, x, u))
+        return _solved(*self.equations(x, u))
 
     def floor_force(self, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> FloorForce:
         """The floor's force is the only external force on the whole robot, besides its weight."""
@@ -179,7 +183,7 @@ class Omni(RollingBall):
         """Total mechanical energy, J, of ball, body, rotors and wheels in state x (..., 11)."""
         _, _, gamma, theta, *_ = parts = ops.components(x)
         speeds = (*parts[4:8], *parts[9:])
-        m = mass_matrix(self, x, relative_turning(self, x)[1])
+        m = self._mass_matrix(x, self.relative_turning(x)[1])
         kinetic = 0.5 * _dot([_dot(row, speeds) for row in m], speeds)
         return kinetic + self.first_moment * self.gravity * ops.cos(gamma) * ops.cos(theta)
 
@@ -189,9 +193,9 @@ class Omni(RollingBall):
         *place, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
         psi, psi_dot, spin = ops.components(x)[8:]
         a, b, d = ops.cos(gamma) * ops.cos(theta), -ops.sin(gamma) * ops.sin(theta), ops.cos(theta)  # of n
-        height, columns = self.com_height, relative_turning(self, x)[1]
+        height, columns = self.com_height, self.relative_turning(x)[1]
         moved = [px, py, height * a * px, height * (b * px + d * py), 0.0 * px, 0.0 * px]
-        changes = solved(mass_matrix(self, x, columns), moved)
+        changes = _solved(self._mass_matrix(x, columns), moved)
         speeds = [v + change for v, change in zip((vx, vy, gamma_dot, theta_dot), changes, strict=False)]
         return ops.stack((*place, gamma, theta, *speeds, psi, psi_dot + changes[4], spin + changes[5]), like=x)
 
@@ -217,7 +221,7 @@ class Omni(RollingBall):
         sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
         # in the frame of the leans, N
         t1, t2, t3 = -cos_g * fy, sin_g * sin_t * fy + cos_t * fx, -sin_g * cos_t * fy + sin_t * fx
-        (w1, w2, w3), _ = relative_turning(self, x)
+        (w1, w2, w3), _ = self.relative_turning(x)
         drag = self.ball_radius * self.wheels.drag(self.force_limit)
         t1, t2, t3 = t1 + ACROSS * drag * w1, t2 + ACROSS * drag * w2, t3 + ALONG * drag * w3
         cos, sin = ops.cos(psi), ops.sin(psi)
@@ -225,134 +229,164 @@ class Omni(RollingBall):
         parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
         return ops.stack(tuple(parts), like=force)
 
+    def torque(self, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
+        """Σ a_i u_i, N·m, of the wheels' forces u (..., 3), N, in the body's frame.
 
-def torque(radius: float, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
-    """Σ a_i u_i, N·m, of a ball's radius, m, and the wheels' forces u (..., 3), N, in the body's frame.
+        With psi, rad, in frame B, in which the body turns.
+        """
+        a, b, c = ops.components(u)
+        radius = self.ball_radius
+        across = -_COS * radius
+        t1, t2, t3 = across * (a - 0.5 * (b + c)), across * math.sqrt(0.75) * (b - c), _SIN * radius * (a + b + c)
+        if psi is None:
+            return t1, t2, t3
+        cos, sin = ops.cos(psi), ops.sin(psi)
+        return cos * t1 - sin * t2, sin * t1 + cos * t2, t3
 
-    With psi, rad, in frame B, in which the body turns.
-    """
-    a, b, c = ops.components(u)
-    across = -_COS * radius
-    t1, t2, t3 = across * (a - 0.5 * (b + c)), across * math.sqrt(0.75) * (b - c), _SIN * radius * (a + b + c)
-    if psi is None:
-        return t1, t2, t3
-    cos, sin = ops.cos(psi), ops.sin(psi)
-    return cos * t1 - sin * t2, sin * t1 + cos * t2, t3
+    def torque_on_ball(self, x: Vector, turning: tuple[Any, Any, Any], u: Vector) -> tuple[Any, ...]:
+        """Σ a_i f_i in the world, N·m, of the wheels on a ball that turns in the world, rad/s, and may slip on the floor.
 
+        The rotors' part is that of the acceleration that the robot has in state x (..., 11) where its ball does not slip.
+        """
+        _, _, gamma, theta, _, _, gamma_dot, theta_dot, _, psi_dot, _ = ops.components(x)
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        axes = (cos_g, 0.0, -sin_g), (-sin_g * sin_t, cos_t, -cos_g * sin_t), (sin_g * cos_t, sin_t, cos_g * cos_t)
+        own = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
+        w = tuple(_dot(axis, turning) - body for axis, body in zip(axes, own, strict=True))
+        faster = self.accelerations(x, u)
+        rotors = self.ball_radius**2 * self.wheels.mass
+        felt = [
+            pull - share * rotors * _dot(row, faster)
+            for pull, share, row in zip(
+                self._pulls(x, u, w),
+                (ACROSS, ACROSS, ALONG),
+                zip(*self.relative_turning(x)[1], strict=True),
+                strict=True,
+            )
+        ]
+        return tuple(_dot(column, felt) for column in zip(*axes, strict=True))
 
-def torque_on_ball(params: Any, x: Vector, turning: tuple[Any, Any, Any], u: Vector) -> tuple[Any, ...]:
-    """Σ a_i f_i in the world, N·m, of the wheels on a ball that turns in the world, rad/s, and may slip on the floor.
+    def rotor_torque(self, turning: np.ndarray, axis: np.ndarray) -> np.ndarray:
+        """(3,) N·m, of the rotors on a ball whose turning relative to the body changes by `turning` (3,), rad/s².
 
-    The rotors' part is that of the acceleration that the robot has in state x (..., 11) where its ball does not slip.
-    """
-    _, _, gamma, theta, _, _, gamma_dot, theta_dot, _, psi_dot, _ = ops.components(x)
-    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    axes = (cos_g, 0.0, -sin_g), (-sin_g * sin_t, cos_t, -cos_g * sin_t), (sin_g * cos_t, sin_t, cos_g * cos_t)
-    own = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
-    w = tuple(_dot(axis, turning) - body for axis, body in zip(axes, own, strict=True))
-    faster = params.accelerations(x, u)
-    rotors = params.ball_radius**2 * params.wheels.mass
-    felt = [
-        pull - share * rotors * _dot(row, faster)
-        for pull, share, row in zip(
-            _pulls(params, x, u, w),
-            (ACROSS, ACROSS, ALONG),
-            zip(*relative_turning(params, x)[1], strict=True),
-            strict=True,
+        Both that and the body's axis, a unit vector (3,), are in one frame.
+        """
+        felt = ACROSS * turning + (ALONG - ACROSS) * (axis @ turning) * axis
+        return -self.wheels.mass * self.ball_radius**2 * felt
+
+    def relative_turning(self, x: Vector) -> tuple[tuple[Any, Any, Any], tuple[tuple[Any, ...], ...]]:
+        """w, rad/s, of a state x (..., 11), and J by columns: six of three entries."""
+        _, _, gamma, theta, *_ = parts = ops.components(x)
+        r = self.ball_radius
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        columns = (
+            (0.0, cos_t / r, sin_t / r),
+            (-cos_g / r, sin_g * sin_t / r, -sin_g * cos_t / r),
+            (0.0, -cos_t, -sin_t),
+            (1.0, 0.0, 0.0),
+            (0.0, 0.0, -1.0),
+            (-sin_g, -cos_g * sin_t, cos_g * cos_t),
         )
-    ]
-    return tuple(_dot(column, felt) for column in zip(*axes, strict=True))
+        speeds = (*parts[4:8], *parts[9:])
+        return tuple(_dot(row, speeds) for row in zip(*columns, strict=True)), columns
+
+    def readings(self, x: Vector, u: Vector) -> tuple[Any, ...]:
+        """What perfect sensors read (9) in state x (..., 11) under u (..., 3), N; see `ballbot_gym.robot.sensors`.
+
+        That is the body's turning (3), rad/s, its specific force (3), m/s², and the wheels' speeds (3), rad/s.
+        """
+        _, _, gamma, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, _ = ops.components(x)
+        ax, ay, gamma_ddot, theta_ddot, *_ = self.accelerations(x, u)
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        rates2, product = gamma_dot * gamma_dot + theta_dot * theta_dot, gamma_dot * theta_dot
+        height = self.com_height
+        ax = ax + height * (
+            cos_g * cos_t * gamma_ddot
+            - sin_g * sin_t * theta_ddot
+            - sin_g * cos_t * rates2
+            - 2 * cos_g * sin_t * product
+        )
+        ay = ay + height * (cos_t * theta_ddot - sin_t * theta_dot * theta_dot)
+        az = self.gravity + height * (
+            2 * sin_g * sin_t * product
+            - sin_g * cos_t * gamma_ddot
+            - cos_g * sin_t * theta_ddot
+            - cos_g * cos_t * rates2
+        )
+        # in the frame of the leans; the body is turned by ψ in this frame
+        turning = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
+        along = cos_g * ax - sin_g * az
+        upright = sin_g * ax + cos_g * az
+        force = along, cos_t * ay - sin_t * upright, sin_t * ay + cos_t * upright
+        relative, _ = self.relative_turning(x)
+        cos, sin = ops.cos(psi), ops.sin(psi)
+        turning, force, relative = ((cos * a + sin * b, cos * b - sin * a, c) for a, b, c in (turning, force, relative))
+        return (*turning, *force, *self._wheel_speeds(relative))
+
+    def equations(self, x: Vector, u: Vector) -> tuple[list[list[Any]], list[Any]]:
+        """M (6, 6) and q (6) of M v̇ = q for state x (..., 11) and the wheels' forces u (..., 3), N."""
+        _, _, gamma, theta, _, _, gamma_dot, theta_dot, _, psi_dot, spin = ops.components(x)
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        w, columns = self.relative_turning(x)
+        pulls = self._pulls(x, u, w)
+        h, axial = self.first_moment, self.axial_inertia
+        half_slope = (axial - self.pivot_inertia) * sin_t * cos_t
+        rates2, product = gamma_dot * gamma_dot + theta_dot * theta_dot, gamma_dot * theta_dot
+        q = (
+            h * (sin_g * cos_t * rates2 + 2 * cos_g * sin_t * product),
+            h * sin_t * theta_dot * theta_dot,
+            h * self.gravity * sin_g * cos_t - 2 * half_slope * product - axial * cos_t * theta_dot * psi_dot,
+            h * self.gravity * cos_g * sin_t + gamma_dot * (half_slope * gamma_dot + axial * cos_t * psi_dot),
+            -axial * cos_t * product,
+            self.wheels.floor_torque(spin),
+        )
+        q = [own + _dot(column, pulls) for own, column in zip(q, columns, strict=True)]
+        return self._mass_matrix(x, columns), q
+
+    def _mass_matrix(self, x: Vector, columns: tuple[tuple[Any, ...], ...]) -> list[list[Any]]:
+        """M (6, 6) at state x (..., 11), with J by columns."""
+        _, _, gamma, theta, *_ = ops.components(x)
+        sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+        mass, h, inertia, axial = self.moving_mass, self.first_moment, self.pivot_inertia, self.axial_inertia
+        rotors = self.wheels.mass * self.ball_radius**2
+        weighted = [(ACROSS * rotors * a, ACROSS * rotors * b, ALONG * rotors * c) for a, b, c in columns]
+        m = [[_dot(a, b) if i <= j else 0.0 for j, b in enumerate(columns)] for i, a in enumerate(weighted)]
+        lean_inertia = inertia * cos_t * cos_t + axial * sin_t * sin_t
+        own = {
+            (0, 0): mass, (0, 2): h * cos_g * cos_t, (0, 3): -h * sin_g * sin_t, (1, 1): mass, (1, 3): h * cos_t,
+            (2, 2): lean_inertia, (2, 4): axial * sin_t, (3, 3): inertia, (4, 4): axial, (5, 5): self.ball_inertia,
+        }  # fmt: skip
+        for (i, j), value in own.items():
+            m[i][j] = m[i][j] + value
+        return [[m[min(i, j)][max(i, j)] for j in range(6)] for i in range(6)]
+
+    def _pulls(self, x: Vector, u: Vector, w: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        """Σ a_i f_i, N·m, of a ball that turns at w, rad/s, in frame B, less what the rotors take of it for J v̇."""
+        *_, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, _ = ops.components(x)
+        sin_t, cos_t = ops.sin(theta), ops.cos(theta)
+        r, wheels, (w1, w2, w3) = self.ball_radius, self.wheels, w
+        # ẇ without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body
+        rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
+        b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
+        bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
+        bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
+        bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
+        t1, t2, t3 = self.torque(u, psi)
+        drag, rotors = r * r * wheels.drag(self.force_limit), r * r * wheels.mass
+        return (
+            t1 - ACROSS * (drag * w1 + rotors * bias1),
+            t2 - ACROSS * (drag * w2 + rotors * bias2),
+            t3 - ALONG * (drag * w3 + rotors * bias3),
+        )
+
+    def _wheel_speeds(self, w: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+        """The wheels' speeds (3), rad/s, against the body, over which the ball turns at w, rad/s, in the body's own frame."""
+        w1, w2, w3 = w
+        ratio = self.ball_radius / self.wheels.radius
+        return tuple([ratio * (_SIN * w3 - _COS * (math.cos(a) * w1 + math.sin(a) * w2)) for a in _AZIMUTHS])
 
 
-def relative_turning(params: Any, x: Vector) -> tuple[tuple[Any, Any, Any], tuple[tuple[Any, ...], ...]]:
-    """w, rad/s, of a state x (..., 11), and J by columns: six of three entries."""
-    _, _, gamma, theta, *_ = parts = ops.components(x)
-    r = params.ball_radius
-    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    columns = (
-        (0.0, cos_t / r, sin_t / r),
-        (-cos_g / r, sin_g * sin_t / r, -sin_g * cos_t / r),
-        (0.0, -cos_t, -sin_t),
-        (1.0, 0.0, 0.0),
-        (0.0, 0.0, -1.0),
-        (-sin_g, -cos_g * sin_t, cos_g * cos_t),
-    )
-    speeds = (*parts[4:8], *parts[9:])
-    return tuple(_dot(row, speeds) for row in zip(*columns, strict=True)), columns
-
-
-def wheel_speeds(params: Any, w: tuple[Any, Any, Any]) -> tuple[Any, ...]:
-    """The wheels' speeds (3), rad/s, against the body, over which the ball turns at w, rad/s, in the body's own frame."""
-    w1, w2, w3 = w
-    ratio = params.ball_radius / params.wheels.radius
-    return tuple([ratio * (_SIN * w3 - _COS * (math.cos(a) * w1 + math.sin(a) * w2)) for a in _AZIMUTHS])
-
-
-def mass_matrix(params: Any, x: Vector, columns: tuple[tuple[Any, ...], ...]) -> list[list[Any]]:
-    """M (6, 6) at state x (..., 11), with J by columns."""
-    _, _, gamma, theta, *_ = ops.components(x)
-    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    mass, h, inertia, axial = params.moving_mass, params.first_moment, params.pivot_inertia, params.axial_inertia
-    rotors = params.wheels.mass * params.ball_radius**2
-    weighted = [(ACROSS * rotors * a, ACROSS * rotors * b, ALONG * rotors * c) for a, b, c in columns]
-    m = [[_dot(a, b) if i <= j else 0.0 for j, b in enumerate(columns)] for i, a in enumerate(weighted)]
-    lean_inertia = inertia * cos_t * cos_t + axial * sin_t * sin_t
-    own = {
-        (0, 0): mass, (0, 2): h * cos_g * cos_t, (0, 3): -h * sin_g * sin_t, (1, 1): mass, (1, 3): h * cos_t,
-        (2, 2): lean_inertia, (2, 4): axial * sin_t, (3, 3): inertia, (4, 4): axial, (5, 5): params.ball_inertia,
-    }  # fmt: skip
-    for (i, j), value in own.items():
-        m[i][j] = m[i][j] + value
-    return [[m[min(i, j)][max(i, j)] for j in range(6)] for i in range(6)]
-
-
-def equations(params: Any, x: Vector, u: Vector) -> tuple[list[list[Any]], list[Any]]:
-    """M (6, 6) and q (6) of M v̇ = q for state x (..., 11) and the wheels' forces u (..., 3), N."""
-    _, _, gamma, theta, _, _, gamma_dot, theta_dot, _, psi_dot, spin = ops.components(x)
-    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    w, columns = relative_turning(params, x)
-    pulls = _pulls(params, x, u, w)
-    h, axial = params.first_moment, params.axial_inertia
-    half_slope = (axial - params.pivot_inertia) * sin_t * cos_t
-    rates2, product = gamma_dot * gamma_dot + theta_dot * theta_dot, gamma_dot * theta_dot
-    q = (
-        h * (sin_g * cos_t * rates2 + 2 * cos_g * sin_t * product),
-        h * sin_t * theta_dot * theta_dot,
-        h * params.gravity * sin_g * cos_t - 2 * half_slope * product - axial * cos_t * theta_dot * psi_dot,
-        h * params.gravity * cos_g * sin_t + gamma_dot * (half_slope * gamma_dot + axial * cos_t * psi_dot),
-        -axial * cos_t * product,
-        floor_torque(params.wheels, spin),
-    )
-    q = [own + _dot(column, pulls) for own, column in zip(q, columns, strict=True)]
-    return mass_matrix(params, x, columns), q
-
-
-def _pulls(params: Any, x: Vector, u: Vector, w: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Σ a_i f_i, N·m, of a ball that turns at w, rad/s, in frame B, less what the rotors take of it for J v̇."""
-    *_, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, _ = ops.components(x)
-    sin_t, cos_t = ops.sin(theta), ops.cos(theta)
-    r, wheels, (w1, w2, w3) = params.ball_radius, params.wheels, w
-    # ẇ without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body
-    rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
-    b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
-    bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
-    bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
-    bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
-    t1, t2, t3 = torque(r, u, psi)
-    drag, rotors = r * r * wheels.drag(params.force_limit), r * r * wheels.mass
-    return (
-        t1 - ACROSS * (drag * w1 + rotors * bias1),
-        t2 - ACROSS * (drag * w2 + rotors * bias2),
-        t3 - ALONG * (drag * w3 + rotors * bias3),
-    )
-
-
-def floor_torque(wheels: Wheels, spin: Any) -> Any:
-    """Of the floor on a ball that spins about the vertical, rad/s: N·m."""
-    return -wheels.spin_friction * spin / ops.sqrt(spin * spin + _SPIN_SPEED**2)
-
-
-def solved(m: list[list[Any]], q: list[Any]) -> tuple[Any, ...]:
+def _solved(m: list[list[Any]], q: list[Any]) -> tuple[Any, ...]:
     """v with M v = q, for a symmetric and positive definite M; both are overwritten."""
     n = len(q)
     for k in range(n):

@@ -24,8 +24,8 @@ from ballbot_gym.robot import (
     PAPER,
     Randomization,
     Robot,
+    Sensors,
     checked_randomization,
-    sensors,
 )
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
@@ -312,7 +312,7 @@ class BallbotBatch:
         asked = actions.to(self.dtype).unbind(-1)
         key = seeding.key(state.seed, state.episode, steps)
         push = seeding.uniforms(key, Randomization.PUSH_DRAWS, self.dtype) if noise.pushes else ()
-        read = seeding.uniforms(key, sensors.DRAWS, self.dtype) if now.sensors else ()
+        read = seeding.uniforms(key, Sensors.DRAWS, self.dtype) if now.sensors else ()
         made = step(self.task, self.params, noise, self._step_state(now), asked, Draws(push, read), self._moved)
         end, did = made.state.x, made.outcome
         truncated = did.truncated

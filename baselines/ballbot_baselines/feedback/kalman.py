@@ -23,7 +23,7 @@ import numpy as np
 
 from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robot import ROBOT_FACTORS, Randomization, Robot, sensors, substeps_for
+from ballbot_gym.robot import ROBOT_FACTORS, Randomization, Robot, Sensors, substeps_for
 from ballbot_gym.step import observation_space
 from ballbot_gym.tasks import Task
 
@@ -204,9 +204,9 @@ class SensorFilter:
     def __init__(self, task: Task, params: Robot):
         self._task, self._params, self._dt = task, params, task.control_dt
         self.model, (self._after, self._over_step) = _robot_and_sensors(params), _control_step(params, task.control_dt)
-        samples = sensors.samples(task.control_dt)
-        noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
-        self.reading_variance = np.array([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        samples = Sensors(params, task.control_dt).samples
+        noise = [Sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [Sensors.ACCELEROMETER_NOISE**2 / samples] * 3
+        self.reading_variance = np.array([*noise, *[Sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
         self._noise = np.diag(self.reading_variance)
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
@@ -231,13 +231,13 @@ class SensorFilter:
         draws = np.random.default_rng(0).random((_DRAWN, self._task.state_draws))
         starts = np.array([self._task.start(tuple(z), tuple(c), self._params) for z in draws.tolist()])
         starts[:, :2] = 0.0  # which sensors report
-        deviations = [*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]
+        deviations = [*np.maximum(starts.std(0), _KNOWN), *[Sensors.GYROSCOPE_BIAS] * 3]
         return np.concatenate([starts.mean(0), np.zeros(3)]), np.array(deviations)
 
     def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
         """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
         of_biases, turned = np.eye(9, 3), np.repeat([1.0, self._dt], (6, 3))
-        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - turned * np.array(expected)[:, 0]
+        missed = np.asarray(seen[:9], np.float64) * Sensors.SCALE - turned * np.array(expected)[:, 0]
         missed[:3] -= self._z[11:]
         h = np.hstack([turned[:, None] * np.array(slopes), of_biases])
         self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
@@ -284,19 +284,19 @@ class StateFromSensors(gymnasium.Wrapper):
 
 
 @lru_cache(maxsize=16)
-def _robot_and_sensors(params: Robot) -> casadi.Function:
+def _robot_and_sensors(params: Any) -> casadi.Function:
     """(x, u) -> rates of the state x (11,) over ideal readings (9,), under the wheels' forces u (3,), N, and their Jacobian
     (20, 11) with respect to x.
     """
     x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
     state, forces = tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(u))
-    found = casadi.vertcat(*params.derivative(state, forces), *sensors.ideal(params, state, forces))
+    found = casadi.vertcat(*params.derivative(state, forces), *params.readings(state, forces))
     return casadi.Function("robot", [x, u], [found, casadi.densify(casadi.jacobian(found, x))], {"cse": True})
 
 
 @lru_cache(maxsize=16)
 def _control_step(params: Robot, dt: float) -> tuple[casadi.Function, casadi.Function]:
-    """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives
+    """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `Sensors.mean` gives of it. Each gives
     its Jacobian with respect to x too.
     """
     model, substeps = _robot_and_sensors(params), substeps_for(dt)

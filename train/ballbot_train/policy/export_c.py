@@ -17,7 +17,7 @@ from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import PAPER, Robot, named_robot, sensors, substeps_for
+from ballbot_gym.robot import PAPER, Robot, Sensors, named_robot, substeps_for
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.policy.export_onnx import metadata
@@ -162,9 +162,9 @@ def _test(network: PolicyNetwork, task: Task, robot: str, filtered: bool) -> dic
     k = np.arange(_TEST_STEPS) if filtered else np.linspace(0, len(seen) - 1, _TEST_STEPS).astype(int)
     shown, times = np.array(seen)[k], (k * task.control_dt).astype(np.float32)
     if filtered:
-        readings = (shown[:, :9] * sensors.SCALE).astype(np.float32)
+        readings = (shown[:, :9] * Sensors.SCALE).astype(np.float32)
         arrays = {"sensors": readings, "place": shown[0, 9:11]}
-        shown = np.hstack([readings / np.array(sensors.SCALE), shown[:, 9:]])
+        shown = np.hstack([readings / np.array(Sensors.SCALE), shown[:, 9:]])
     else:
         shown = shown.astype(np.float32)
         arrays = {"states": shown}
