@@ -22,17 +22,16 @@ from ballbot_gym.checks import (
 )
 from ballbot_gym.drawing import Drawing, Drawn
 from ballbot_gym.drawing.picture import picture
-from ballbot_gym.drawing.viewer import Viewer, can_show, need_library
+from ballbot_gym.drawing.viewer import Viewer
 from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.machine_code.single import StepCode, StepProblem, step_code
+from ballbot_gym.machine_code.single import StepCode, StepProblem
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robot import (
     PAPER,
     Randomization,
     Robot,
     Sensors,
-    checked_randomization,
     checked_robot,
     named_robot,
     own_fields,
@@ -208,14 +207,14 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         if render_mode == "human":
-            need_library()
+            Viewer.need_library()
         self.task = make_task(task, self.params, **task_fields)
         self.render_mode = render_mode
-        modes, fps = ["human", "rgb_array"] if can_show() else ["rgb_array"], round(1 / self.task.control_dt)
+        modes, fps = ["human", "rgb_array"] if Viewer.is_possible() else ["rgb_array"], round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
         dt = self.task.control_dt
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
-        self.randomization = checked_randomization(randomization, self.params)
+        self.randomization = Randomization.checked(randomization, self.params)
         self._robot = self.params  # of the episode
         self.observation = check_observation(observation, self.params, self.randomization)
         self.randomization.delay_steps(dt)  # raises an error where it is no whole number of these
@@ -438,7 +437,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             self._simulator.set_params(self._robot)
         self._simulator.reset(now.x, memory)
         if self._code is None:
-            self._code = step_code(self.step_problem, self.params)
+            self._code = StepCode.compiled(self.step_problem, self.params)
         if self._code is not None:
             self._code.begin(now.c, now.drawn, self.params, self._robot)
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.robot import Randomization, Robot, Sensors, needed_friction
+from ballbot_gym.robot import Randomization, Robot, Sensors
 from ballbot_gym.tasks.base import Task
 
 _LARGEST_OBSERVED = 1e6  # far beyond what any episode shows
@@ -166,7 +166,7 @@ def by_engine(end: tuple[Any, ...], floor: tuple[Any, ...], stable: Any, dt: flo
 
     def move(robot: Any, x: tuple[Any, ...], u: tuple[Any, ...]) -> tuple[tuple[Any, ...], ...]:
         # a ball that slips in a simulation is no failure
-        grip, kept = ((*floor, needed_friction(floor)), (0.0,)) if floor else robot.held(x, u, dt)  # pyright: ignore
+        grip, kept = ((*floor, robot.needed_friction(floor)), (0.0,)) if floor else robot.held(x, u, dt)  # pyright: ignore
         return end, grip, (*kept, stable)
 
     return move  # pyright: ignore[reportReturnType]

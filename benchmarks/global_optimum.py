@@ -25,7 +25,7 @@ from scipy.ndimage import map_coordinates
 from ballbot_baselines import find_optimum
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import files
-from ballbot_gym.robot import default_params, substeps_for
+from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 
 _PLANE = [0, 2, 4, 6]  # x, γ, ẋ, γ̇
@@ -56,7 +56,7 @@ def after(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     none = np.zeros_like(u)
     state = (x[0], none, x[1], none, x[2], none, x[3], none)
     dt = TASK.control_dt
-    return np.stack(PARAMS.step(state, (u, none), dt, substeps_for(dt))[::2])
+    return np.stack(PARAMS.step(state, (u, none), dt, PARAMS.substeps(dt))[::2])
 
 
 def step_cost(x: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from ballbot_gym import files
 from ballbot_gym.robot import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.paths import sides_passed
-from ballbot_gym.tasks.weave import MAX_OBSTACLES, Weave, split_constants
+from ballbot_gym.tasks.weave import MAX_OBSTACLES, Weave
 
 TASK, PARAMS = Weave(), default_params()
 Choice = tuple[int, ...]
@@ -32,7 +32,7 @@ def cost_of(x0: np.ndarray, c: np.ndarray, kept: tuple[int, ...], choice: Choice
 
     The cost is infinite where no such optimum is found.
     """
-    goal, obstacles = split_constants(c)
+    goal, obstacles = Weave.split_constants(c)
     rows = [obstacles[i] for i in kept]
     fewer = np.concatenate([goal, *rows, *[rows[-1]] * (MAX_OBSTACLES - len(rows))])
     start = TASK.routed_path(x0, fewer, choice)

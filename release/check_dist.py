@@ -21,7 +21,7 @@ import gymnasium, numpy as np
 from gymnasium.utils.env_checker import check_env
 import ballbot_gym
 from ballbot_gym import certified
-from ballbot_gym.machine_code.single import step_code
+from ballbot_gym.machine_code.single import StepCode
 from ballbot_train import evaluate
 
 for task in ballbot_gym.TASKS.values():
@@ -34,7 +34,7 @@ for task in ballbot_gym.TASKS.values():
         observations, rewards, *_ = envs.step(actions)
         assert np.isfinite(observations).all() and np.isfinite(rewards).all()
     speed = 10 * 16384 / (time.perf_counter() - begin)
-    code = step_code(env.unwrapped.step_problem, env.unwrapped.params)
+    code = StepCode.compiled(env.unwrapped.step_problem, env.unwrapped.params)
     optima = certified.load(task(), ballbot_gym.default_params())
     row = evaluate(lambda observation: np.zeros(2), env.unwrapped.task, episodes=2)
     kinds = f"{type(code).__name__}, {type(envs.unwrapped.batch).__name__}"

@@ -15,7 +15,6 @@ from ballbot_baselines import Optimum, find_optima, find_optimum
 from ballbot_baselines.optimum.batched import multistart, search_many
 from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym import certified, machine_code, ops
-from ballbot_gym.robot import substeps_for
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit
@@ -78,7 +77,7 @@ def followed(task, params, x0, c, steps, feedback):
     for k in range(steps):
         u = np.clip(feedback(k, x), -params.force_limit, params.force_limit)
         cost += task.control_dt * task.cost(x, u, c)
-        x = params.step(x, u, task.control_dt, substeps_for(task.control_dt))
+        x = params.step(x, u, task.control_dt, params.substeps(task.control_dt))
         states.append(x)
     return cost, np.array(states)
 

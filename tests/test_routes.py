@@ -9,7 +9,7 @@ import torch
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import default_params
-from ballbot_gym.tasks.weave import split_constants
+from ballbot_gym.tasks.weave import Weave
 from ballbot_train.evaluation import fresh
 from ballbot_train.learning import routing
 from ballbot_train.learning.actors import spec_for
@@ -49,7 +49,7 @@ def test_mirrored_slaloms_are_passed_on_mirrored_sides_and_repeated_obstacles_on
     given = network.routes(observed(x, c))
     assert torch.equal(network.routes(observed(x * mirror.state, c * mirror.constants)), -given)
     for sides_given, constants in zip(given, c, strict=True):
-        _, obstacles = split_constants(constants)
+        _, obstacles = Weave.split_constants(constants)
         assert (sides_given[len(obstacles) - 1 :] == sides_given[len(obstacles) - 1]).all()
 
 

@@ -10,7 +10,7 @@ from ballbot_baselines.optimum import sides
 from ballbot_baselines.optimum.guesses import ALL_GUESSES
 from ballbot_gym import certified
 from ballbot_gym.tasks.paths import sides_passed
-from ballbot_gym.tasks.weave import Weave, split_constants
+from ballbot_gym.tasks.weave import Weave
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def predicted(task, params, x0, c, path):
 def test_predicted_motions_clear_every_obstacle_on_their_side(slaloms, params):
     task = Weave()
     for x0, c, path in slaloms[:5]:
-        _, obstacles = split_constants(c)
+        _, obstacles = Weave.split_constants(c)
         found = predicted(task, params, x0, c, path)
         assert len(found.sides) == 2 ** len(obstacles)
         passed = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]

@@ -103,7 +103,7 @@ def test_goals_limits_and_ends_are_those_of_python(task):
     env: Any = BallbotEnv(task, "rk4")
     robot = env.params
     problem = env.step_problem._replace(substeps=0)
-    code = single.step_code(problem, robot)
+    code = single.StepCode.compiled(problem, robot)
     assert code is not None
     rng, ends = np.random.default_rng(0), set()
     for i in range(100):

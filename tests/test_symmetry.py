@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.tasks.orbit import steady_orbit
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.policy.files import PolicySpec
@@ -108,7 +107,7 @@ def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, inde
 def steady_motion(task, c, params, rng):
     """A state and the force of the motion in which an episode shall end."""
     if task.id == "BallbotOrbit-v0":
-        states, forces = steady_orbit(params, *c, rng.uniform(0, 6, 1))
+        states, forces = params.steady_orbit(*c, rng.uniform(0, 6, 1))
         return states[0], forces[0]
     goal = c[:2] if len(c) else np.zeros(2)
     return np.array([*goal, *np.zeros(6)]), np.zeros(2)

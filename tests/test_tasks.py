@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ballbot_gym.tasks.base import Reference
-from ballbot_gym.tasks.orbit import Orbit, orbit_tilt, steady_orbit
+from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
-from ballbot_gym.tasks.weave import Weave, split_constants
+from ballbot_gym.tasks.weave import Weave
 
 X = np.array([0.5, -1.5, 0.3, -0.4, 2.0, -3.0, 0.7, -0.8])
 U = np.array([100.0, -200.0])
@@ -64,7 +64,7 @@ def test_everything_is_differentiable_even_at_the_origin_and_in_an_obstacle(task
     jacobian = casadi.Function("jacobian", [sx, su, sc], [casadi.jacobian(everything, casadi.vertcat(sx, su))])
     centre = np.zeros(8)
     if isinstance(task, Weave):
-        centre[:2] = split_constants(c[0])[1][0, :2]
+        centre[:2] = Weave.split_constants(c[0])[1][0, :2]
     for x in (np.zeros(8), centre):
         assert np.isfinite(np.array(jacobian(x, np.zeros(2), c[0]))).all()
 
@@ -142,7 +142,7 @@ def test_gate_at_speed_is_turns_goal():
 
 def test_steady_orbit_is_orbits_goal_and_nearly_free(params):
     for speed in (3.0, -3.0):
-        states, forces = steady_orbit(params, 1.5, speed, np.linspace(0, 6, 7))
+        states, forces = params.steady_orbit(1.5, speed, np.linspace(0, 6, 7))
         for x, u in zip(states, forces, strict=True):
             assert Orbit().is_goal(tuple(x), (1.5, speed))
             free = dataclasses.replace(Orbit(), lean_rate_weight=1e-12, effort_weight=1e-12)
@@ -194,7 +194,7 @@ def test_turn_starts_at_the_papers_place_at_the_drawn_speed(params):
 
 def test_orbit_speeds_lean_from_10_to_45_degrees_in_both_directions(params):
     x, c = draw(Orbit(), params, 500)
-    tilts = np.degrees([orbit_tilt(params, r, v) for r, v in c])
+    tilts = np.degrees([params.steady_tilt(r, v) for r, v in c])
     assert 10 <= tilts.min() < 11
     assert 44 < tilts.max() <= 45
     assert 0.4 < (c[:, 1] > 0).mean() < 0.6
@@ -238,18 +238,18 @@ def test_reference_is_a_motion_that_the_robot_makes(task, params):
             np.testing.assert_allclose(after[:-1], reference.x[1:], atol=1e-9)
 
 
-def test_orbit_tilt_inverts_orbit_speed(params):
+def test_the_steady_tilt_inverts_the_steady_speed(params):
     for radius in (0.9, 1.0, 2.0, 3.0):
         for tilt in np.radians([5, 10, 30, 45]):
-            assert orbit_tilt(params, radius, params.steady_speed(radius, tilt)) == pytest.approx(tilt, abs=1e-9)
+            assert params.steady_tilt(radius, params.steady_speed(radius, tilt)) == pytest.approx(tilt, abs=1e-9)
 
 
 def orbit_accelerations(params, radius, speed):
     """(24, 4) accelerations of the dynamics along the steady orbit, and those that staying on it takes."""
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    x, u = steady_orbit(params, radius, speed, bearings)
+    x, u = params.steady_orbit(radius, speed, bearings)
     h = 1e-5  # rad
-    ahead, behind = (steady_orbit(params, radius, speed, bearings + s * h)[0] for s in (1, -1))
+    ahead, behind = (params.steady_orbit(radius, speed, bearings + s * h)[0] for s in (1, -1))
     along = (ahead - behind) / (2 * h) * speed / radius
     np.testing.assert_allclose(x[:, 4:], along[:, :4], atol=1e-6)  # velocities are those of the motion
     return params.derivative(x, u)[:, 4:], along[:, 4:]
@@ -280,7 +280,7 @@ def test_slaloms_have_2_to_5_staggered_obstacles_of_the_documented_sizes_and_lea
     _, c = draw(Weave(), params, 2000)
     counts = []
     for constants in c:
-        goal, obstacles = split_constants(constants)
+        goal, obstacles = Weave.split_constants(constants)
         counts.append(len(obstacles))
         assert 6 <= goal[0] <= 9
         assert goal[1] == 0
@@ -300,7 +300,7 @@ def test_guessed_paths_try_every_choice_of_sides_and_one_clears_all_obstacles(pa
     task = Weave()
     x, c = draw(task, params, 100)
     for start, constants in zip(x, c, strict=True):
-        goal, obstacles = split_constants(constants)
+        goal, obstacles = Weave.split_constants(constants)
         paths = task.guess_paths(start, constants, params)
         assert any((distances(path, obstacles) > obstacles[:, 2] + params.ball_radius).all() for path in paths)
         assert len(paths) == 2 ** len(obstacles)

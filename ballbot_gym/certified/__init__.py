@@ -29,7 +29,6 @@ from ballbot_gym.robot import (
     named_robot,
     robot_name,
     short_name,
-    track_of,
 )
 from ballbot_gym.tasks import SHIPPED, Task
 from ballbot_gym.tasks.identity import problem_parts
@@ -176,7 +175,7 @@ def load(
     try:
         if path is None and name_of(task) is None:  # a subclass may have its parent's id and name
             raise CertificateError(f"there is no evaluation set of {type(task).__name__}, which is not in TASKS")
-        track = track_of(randomization)
+        track = randomization.track
         if path is None and randomization.moves_optima and not track:
             raise CertificateError(f"there is no evaluation set of {randomization}, which is not in TRACKS")
         given = path_of(task, name, track) if path is None else Path(path)
@@ -190,7 +189,7 @@ def load(
         cached = None if path is not None else from_cache(task, params, needed, randomization)
         if cached is not None:
             return cached
-        again = _command(task, params, name, path is not None, track_of(randomization))
+        again = _command(task, params, name, path is not None, randomization.track)
         raise CertificateError(f"{error}; {again}") from error.__cause__
 
 

@@ -36,16 +36,6 @@ _LOGGER.addHandler(logging.NullHandler())
 _LOGGER.propagate = False  # clients that leave in the middle would write tracebacks onto the user's terminal
 
 
-def can_show() -> bool:
-    """Whether the library that serves the page is installed."""
-    return find_spec("websockets") is not None
-
-
-def need_library() -> None:
-    """Raises an ImportError that says what to do where the library is missing."""
-    lazy.need('the page of render_mode="human" and of `ballbot play`', "websockets", extra="play")
-
-
 class Viewer:
     """A server whose page shows the last drawing. Every browser that opens `address` sees the same.
 
@@ -64,7 +54,7 @@ class Viewer:
             ValueError: no such port.
             OSError: neither the port nor one of the next hundred is free.
         """
-        need_library()
+        self.need_library()
         if not 0 <= port < 2**16:
             raise ValueError(f"port must be 0 to {2**16 - 1}, not {port}")
         data = f"const DATA = {json.dumps(look(default_params()))};"
@@ -80,6 +70,16 @@ class Viewer:
         self._stopped = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
+
+    @staticmethod
+    def is_possible() -> bool:
+        """Whether the library that serves the page is installed."""
+        return find_spec("websockets") is not None
+
+    @staticmethod
+    def need_library() -> None:
+        """Raises an ImportError that says what to do where the library is missing."""
+        lazy.need('the page of render_mode="human" and of `ballbot play`', "websockets", extra="play")
 
     @property
     def address(self) -> str:

@@ -155,6 +155,24 @@ class StepCode:
         self._slices = slices = [slice(end - size, end) for end, size in zip(ends, results.values(), strict=True)]
         self.x, self.force = (numbers[slices[list(results).index(name)]] for name in ("x", "force"))
 
+    @classmethod
+    def compiled(cls, problem: StepProblem, robot: Robot) -> "StepCode | None":
+        """The code of a step of robots of one kind, which is tried with this one.
+
+        It is None where there is no code, and the log says why.
+        """
+        try:
+            if problem not in _functions:
+                _functions[problem] = None
+                _functions[problem] = _function(problem, robot)
+            function = _functions[problem]
+        except (
+            Exception
+        ) as error:  # no compiler, cache, CasADi or hash of the task, or any error of users' code given a symbol
+            _log.info("%s stays in Python: %s: %s", problem.task.id, type(error).__name__, error)
+            return None
+        return None if function is None else cls(problem, function)
+
     def begin(self, c: Numbers, drawn: Numbers, robot: Robot, model: Robot) -> None:
         """Takes what stays the same during an episode: constants, draws, the nominal robot and that of the episode."""
         problem = self._problem
@@ -190,21 +208,6 @@ class StepCode:
                 v[grip],
             )
         ), v[measured]
-
-
-def step_code(problem: StepProblem, robot: Robot) -> StepCode | None:
-    """The code of a step of robots of one kind, with which it is tried; None where there is none, and the log says why."""
-    try:
-        if problem not in _functions:
-            _functions[problem] = None
-            _functions[problem] = _function(problem, robot)
-        function = _functions[problem]
-    except (
-        Exception
-    ) as error:  # no compiler, cache, CasADi or hash of the task, or any error of users' code given a symbol
-        _log.info("%s stays in Python: %s: %s", problem.task.id, type(error).__name__, error)
-        return None
-    return None if function is None else StepCode(problem, function)
 
 
 _functions: dict[StepProblem, Callable[..., None] | None] = {}

@@ -4,19 +4,16 @@ from ballbot_gym.robot.ballbot import (
     LEAST_NORMAL_FORCE,
     Ballbot,
     cos_tilt,
-    needed_friction,
     tilt,
 )
-from ballbot_gym.robot.base import RK4_STEP, Kind, Quantity, Robot, substeps_for
+from ballbot_gym.robot.base import RK4_STEP, Kind, Quantity, Robot
 from ballbot_gym.robot.omni import Omni, Wheels
 from ballbot_gym.robot.point_ball import PointBall
 from ballbot_gym.robot.randomization import (
     ROBOT_FACTORS,
     TRACKS,
     Randomization,
-    checked_randomization,
     normals,
-    track_of,
 )
 from ballbot_gym.robot.registry import (
     PAPER,
@@ -75,14 +72,12 @@ __all__ = [
     "UrdfError",
     "Wheels",
     "check_name",
-    "checked_randomization",
     "checked_robot",
     "cos_tilt",
     "default_params",
     "file_name",
     "first_of_kind",
     "named_robot",
-    "needed_friction",
     "normals",
     "own_fields",
     "read_urdf",
@@ -91,8 +86,6 @@ __all__ = [
     "robot_name",
     "robot_setting",
     "short_name",
-    "substeps_for",
     "tilt",
-    "track_of",
     "urdf_text",
 ]  # fmt: skip

@@ -185,6 +185,35 @@ class Ballbot(_Derived, Robot):
     def steady_speed(self, radius: Any, tilt: Any) -> Any:
         """Speed, m/s, at which a steady circle of this radius, m, leans inwards by this tilt, rad."""
 
+    def steady_tilt(self, radius: float, speed: float) -> float:
+        """Steady inward tilt, rad: the inverse of `steady_speed`, by bisection (it grows with speed)."""
+        low, high = 0.0, math.atan(1e3)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            h, inertia = self.first_moment, self.pivot_inertia
+            too_fast = inertia * math.sin(middle) >= h * radius  # sufficient where the ball rolls
+            low, high = (low, middle) if too_fast or self.steady_speed(radius, middle) > abs(speed) else (middle, high)
+        return 0.5 * (low + high)
+
+    def steady_orbit(self, radius: float, speed: float, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, 8) and forces (n, 2), N, of the steady circle at ball bearings (n,), rad.
+
+        The circle is counter-clockwise if the speed is positive.
+        """
+        tilt, rate = self.steady_tilt(radius, speed), speed / radius
+        outward = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+        along = np.stack([-np.sin(bearings), np.cos(bearings)], axis=1)
+        axis, axis_dot = -math.sin(tilt) * outward, -math.sin(tilt) * rate * along  # of n_x, n_y
+        theta = np.arcsin(axis[:, 1])
+        gamma = np.arctan2(axis[:, 0], math.cos(tilt))
+        theta_dot = axis_dot[:, 1] / np.cos(theta)
+        gamma_dot = axis_dot[:, 0] * math.cos(tilt) / (math.cos(tilt) ** 2 + axis[:, 0] ** 2)
+        states = np.column_stack([radius * outward, gamma, theta, speed * along, gamma_dot, theta_dot])
+        com_radius = radius - self.com_height * math.sin(tilt)
+        ball_mass = self.ball_mass + (self.moving_mass - self.total_mass)
+        pull = rate**2 * (ball_mass * radius + self.body_mass * com_radius)
+        return states, -pull * outward
+
     @abstractmethod
     def floor_force(self, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> FloorForce:
         """As `contact`, of a state's accelerations."""
@@ -266,12 +295,18 @@ class Ballbot(_Derived, Robot):
         slip = ops.squared(fx, fy) / (weight * self.friction) ** 2
         return load - LEAST_NORMAL_FORCE, ops.squared(load) - slip
 
+    @staticmethod
+    def needed_friction(force: FloorForce) -> Any:
+        """The coefficient of friction that the floor's force (f_x, f_y, N) needs: |f|/N, and inf where N ≤ 0."""
+        fx, fy, normal = force
+        return ops.where(normal > 0, ops.sqrt(ops.squared(fx, fy)) / ops.where(normal > 0, normal, 1.0), math.inf)
+
     def held(self, x: Vector, u: Vector, hold: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         if not self.grips:
             return (), ()
         begin, end = self.held_contact(x, u, hold)
         kept = [ops.minimum(*self.grip_limits(force)) for force in (begin, end)]
-        needed = ops.maximum(needed_friction(begin), needed_friction(end))
+        needed = ops.maximum(self.needed_friction(begin), self.needed_friction(end))
         return (*begin, needed), (ops.minimum(*kept),)
 
     def grip_reserve(self, x: Vector, u: Vector, hold: Any) -> Any:
@@ -317,12 +352,6 @@ class Ballbot(_Derived, Robot):
             Cylinder(low, cap, self.body_radius),
             Cylinder(cap, top, 1.02 * self.body_radius, DARK),
         ]
-
-
-def needed_friction(force: FloorForce) -> Any:
-    """The coefficient of friction that the floor's force (f_x, f_y, N) needs: |f|/N, and inf where N ≤ 0."""
-    fx, fy, normal = force
-    return ops.where(normal > 0, ops.sqrt(ops.squared(fx, fy)) / ops.where(normal > 0, normal, 1.0), math.inf)
 
 
 def cos_tilt(x: Vector) -> Any:

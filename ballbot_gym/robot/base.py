@@ -215,9 +215,10 @@ class Robot(ABC):
         """Components of an action."""
         return len(self.ACTION)
 
-    def substeps(self, dt: float) -> int:
-        """Steps in which `step` computes a control step of dt seconds."""
-        return 1 if self.DISCRETE else substeps_for(dt)
+    @classmethod
+    def substeps(cls, dt: float) -> int:
+        """Steps in which `step` computes a control step of dt seconds: RK4 steps of at most `RK4_STEP`."""
+        return 1 if cls.DISCRETE else max(1, math.ceil(dt / RK4_STEP - 1e-9))
 
     @property
     def kind(self) -> Kind:
@@ -246,7 +247,7 @@ class Robot(ABC):
             x: (..., n) state.
             u: (..., m), held over the step.
             dt: s.
-            substeps: RK4 steps taken; `substeps_for(dt)` keeps each within RK4_STEP.
+            substeps: RK4 steps taken; `substeps(dt)` keeps each within `RK4_STEP`.
             derivative: what gives `derivative`, compiled perhaps.
 
         Returns:
@@ -257,11 +258,6 @@ class Robot(ABC):
         for _ in range(substeps):
             parts = _rk4(slope, parts, force, dt / substeps)
         return ops.stack(parts, like=x)
-
-
-def substeps_for(dt: float) -> int:
-    """RK4 steps per control step of dt seconds."""
-    return max(1, math.ceil(dt / RK4_STEP - 1e-9))
 
 
 def _rk4(slope: Callable[..., Any], x: tuple, u: tuple, dt: Any) -> tuple:

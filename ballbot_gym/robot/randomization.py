@@ -103,6 +103,36 @@ class Randomization:
         if self.push_interval == 0:
             raise ValueError("Randomization: push_interval must be positive, not 0")
 
+    @classmethod
+    def checked(cls, randomization: Any, params: Robot | None = None) -> "Randomization":
+        """The randomization that was given, also by its name in `TRACKS` or as the dict of all its fields, or none for None.
+
+        Raises:
+            ValueError: no track of that name, or it pushes a robot, params, whose action is no horizontal force.
+            TypeError: it is something else, such as a dict of some fields.
+        """
+        if randomization is None:
+            return cls()
+        if isinstance(randomization, str):
+            if randomization not in TRACKS:
+                raise ValueError(f"unknown randomization {randomization!r}; known: {', '.join(map(repr, TRACKS))}")
+            return TRACKS[randomization]
+        randomization = from_fields(cls, randomization)
+        if not isinstance(randomization, cls):
+            raise TypeError(
+                f"randomization must be a Randomization, for instance Randomization(lean_noise=0.01), not {randomization!r}"
+            )
+        if params is not None and randomization.pushes and not params.PUSHABLE:
+            raise ValueError(
+                f"pushes add to an action Fx, Fy, which {type(params).__name__} does not have; leave out push_impulse"
+            )
+        return randomization
+
+    @property
+    def track(self) -> str:
+        """Its name in `TRACKS`, or ""."""
+        return next((name for name, track in TRACKS.items() if track == self), "")
+
     @cached_property
     def varies_robot(self) -> bool:
         """Whether robots differ from the nominal one."""
@@ -257,36 +287,6 @@ class Randomization:
         drift, lean, rate = drawn[8:10], drawn[10:12], drawn[12:14]
         errors = (*(time * part for part in drift), *lean, *drift, *rate)
         return tuple(value + error for value, error in zip(seen, errors, strict=False)) + seen[8:]
-
-
-def track_of(randomization: Randomization) -> str:
-    """Its name in `TRACKS`, or ""."""
-    return next((name for name, track in TRACKS.items() if track == randomization), "")
-
-
-def checked_randomization(randomization: Any, params: Robot | None = None) -> Randomization:
-    """The randomization that was given, also by its name in `TRACKS` or as the dict of all its fields, or none for None.
-
-    Raises:
-        ValueError: no track of that name, or it pushes a robot, params, whose action is no horizontal force.
-        TypeError: it is something else, such as a dict of some fields.
-    """
-    if randomization is None:
-        return Randomization()
-    if isinstance(randomization, str):
-        if randomization not in TRACKS:
-            raise ValueError(f"unknown randomization {randomization!r}; known: {', '.join(map(repr, TRACKS))}")
-        return TRACKS[randomization]
-    randomization = from_fields(Randomization, randomization)
-    if not isinstance(randomization, Randomization):
-        raise TypeError(
-            f"randomization must be a Randomization, for instance Randomization(lean_noise=0.01), not {randomization!r}"
-        )
-    if params is not None and randomization.pushes and not params.PUSHABLE:
-        raise ValueError(
-            f"pushes add to an action Fx, Fy, which {type(params).__name__} does not have; leave out push_impulse"
-        )
-    return randomization
 
 
 def normals(z: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -81,3 +81,17 @@ class BallbotTask(Task):
         px, py, *_ = ops.components(x)
         x_centre, y_centre, radius = self.arena(c)
         return (*self.margins(x, c), (radius * radius - squared(px - x_centre, py - y_centre)) / (2 * radius))
+
+    @staticmethod
+    def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
+        """The `goal` of a task that ends at rest at a point, m.
+
+        All numbers are ≤ 0 within 0.1 m of it, below 0.1 m/s, 2° of tilt and 0.1 rad/s of lean rate.
+        """
+        px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
+        return (
+            squared(px - x_goal, py - y_goal) / 0.1**2 - 1,
+            squared(vx, vy) / 0.1**2 - 1,
+            (1 - cos_tilt(x)) / (1 - math.cos(math.radians(2))) - 1,
+            squared(gamma_dot, theta_dot) / 0.1**2 - 1,
+        )

@@ -117,7 +117,7 @@ class Orbit(BallbotTask):
         radius, speed = map(float, c)
         return {
             "radius, m": radius,
-            "steady tilt, degrees": math.degrees(orbit_tilt(params, radius, speed)),
+            "steady tilt, degrees": math.degrees(params.steady_tilt(radius, speed)),
             "speed, m/s": abs(speed),
             "direction, 1 is counter-clockwise": math.copysign(1.0, speed),
         }
@@ -160,7 +160,7 @@ class Orbit(BallbotTask):
         steps = max(8, round(2 * math.pi / abs(rate) / self.control_dt))
         start = math.atan2(x[1], x[0])
         bearings = start + math.copysign(2 * math.pi, rate) * np.arange(steps) / steps
-        states, forces = steady_orbit(params, c[0], c[1], bearings)
+        states, forces = params.steady_orbit(c[0], c[1], bearings)
         return Reference(states, forces, closed=True)
 
     def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> list[np.ndarray]:
@@ -183,31 +183,3 @@ class Orbit(BallbotTask):
         radius, speed = ops.components(c)
         rate = speed / radius
         return (squared(px, py) - radius * radius) / (2 * radius), vx + rate * py, vy - rate * px
-
-
-def orbit_tilt(params: Ballbot, radius: float, speed: float) -> float:
-    """Steady inward tilt, rad: the inverse of `Ballbot.steady_speed`, by bisection (it grows with speed)."""
-    low, high = 0.0, math.atan(1e3)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        h, inertia = params.first_moment, params.pivot_inertia
-        too_fast = inertia * math.sin(middle) >= h * radius  # sufficient where the ball rolls
-        low, high = (low, middle) if too_fast or params.steady_speed(radius, middle) > abs(speed) else (middle, high)
-    return 0.5 * (low + high)
-
-
-def steady_orbit(params: Ballbot, radius: float, speed: float, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States (n, 8) and forces (n, 2) of the steady orbit at ball bearings (n,), rad."""
-    tilt, rate = orbit_tilt(params, radius, speed), speed / radius
-    outward = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    along = np.stack([-np.sin(bearings), np.cos(bearings)], axis=1)
-    axis, axis_dot = -math.sin(tilt) * outward, -math.sin(tilt) * rate * along  # of n_x, n_y
-    theta = np.arcsin(axis[:, 1])
-    gamma = np.arctan2(axis[:, 0], math.cos(tilt))
-    theta_dot = axis_dot[:, 1] / np.cos(theta)
-    gamma_dot = axis_dot[:, 0] * math.cos(tilt) / (math.cos(tilt) ** 2 + axis[:, 0] ** 2)
-    states = np.column_stack([radius * outward, gamma, theta, speed * along, gamma_dot, theta_dot])
-    com_radius = radius - params.com_height * math.sin(tilt)
-    ball_mass = params.ball_mass + (params.moving_mass - params.total_mass)
-    pull = rate**2 * (ball_mass * radius + params.body_mass * com_radius)
-    return states, -pull * outward

@@ -8,7 +8,7 @@ import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, between, scaled, squared
-from ballbot_gym.robot import Ballbot, cos_tilt, tilt
+from ballbot_gym.robot import Ballbot, tilt
 from ballbot_gym.tasks.ballbot import BallbotTask
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
@@ -108,7 +108,7 @@ class Stabilize(BallbotTask):
         return 0.0, 0.0, self.arena_radius
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        return at_rest(x)
+        return self.at_rest(x)
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
         return Reference(np.zeros((1, 8)), np.zeros((1, 2)))
@@ -123,14 +123,3 @@ class Stabilize(BallbotTask):
 
     def markers(self, c: np.ndarray) -> list[Marker]:
         return [Marker((0.0, 0.0), 0.3, 0.01, (0.1, 0.6, 0.3, 1.0))]
-
-
-def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
-    """Numbers that are all ≤ 0 within 0.1 m of a point, below 0.1 m/s, 2° of tilt and 0.1 rad/s of lean rate."""
-    px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
-    return (
-        squared(px - x_goal, py - y_goal) / 0.1**2 - 1,
-        squared(vx, vy) / 0.1**2 - 1,
-        (1 - cos_tilt(x)) / (1 - math.cos(math.radians(2))) - 1,
-        squared(gamma_dot, theta_dot) / 0.1**2 - 1,
-    )

@@ -121,7 +121,7 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
 def _steady_orbit(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
     """`_radial`'s features on the steady orbit of the paper's robot, and the force inwards that keeps it there.
 
-    See `orbit.steady_orbit`; to 0.001.
+    See `Ballbot.steady_orbit`; to 0.001.
     """
     radius, speed, pull = features[10:13]
     none = 0.0 * radius

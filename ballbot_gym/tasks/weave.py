@@ -13,7 +13,6 @@ from ballbot_gym.tasks.ballbot import BallbotTask
 from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.paths import catmull_rom, then_stay
-from ballbot_gym.tasks.stabilize import at_rest
 from ballbot_gym.tasks.symmetry import MIRROR_Y
 
 MAX_OBSTACLES = 5
@@ -116,7 +115,7 @@ class Weave(BallbotTask):
         return (distance, 0.0 * distance, *(value for obstacle in obstacles for value in obstacle))
 
     def measures(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> dict[str, float]:
-        goal, obstacles = split_constants(c)
+        goal, obstacles = self.split_constants(c)
         free = [
             float(np.hypot(*(b - a)[:2]) - a[2] - b[2] - 2 * self.ball_radius) for a, b in itertools.pairwise(obstacles)
         ]
@@ -129,7 +128,7 @@ class Weave(BallbotTask):
         }
 
     def check_constants(self, c: np.ndarray, params: Ballbot) -> None:
-        goal, obstacles = split_constants(c)
+        goal, obstacles = self.split_constants(c)
         for i, (x, y, radius) in enumerate(obstacles):
             if radius <= 0:
                 raise ValueError(f"{self.id}: obstacle{i}_radius must be positive, not {radius:g} m")
@@ -170,7 +169,7 @@ class Weave(BallbotTask):
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         x_goal, y_goal, *_ = ops.components(c)
-        return at_rest(x, x_goal, y_goal)
+        return self.at_rest(x, x_goal, y_goal)
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> Reference:
         """At rest at the goal: linear control does not consider obstacles."""
@@ -180,14 +179,14 @@ class Weave(BallbotTask):
 
     def guess_paths(self, x: np.ndarray, c: np.ndarray, params: Ballbot) -> list[np.ndarray]:
         """A path for every choice of sides, the shortest first: the best choice is mostly among the first three."""
-        _, obstacles = split_constants(c)
+        _, obstacles = self.split_constants(c)
         paths = [self.routed_path(x, c, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))]
         paths.sort(key=lambda path: np.hypot(*np.diff(path, axis=0).T).sum())
         return paths
 
     def routed_path(self, x: np.ndarray, c: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
         """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
-        goal, obstacles = split_constants(c)
+        goal, obstacles = self.split_constants(c)
         clearance = obstacles[:, 2] + self.ball_radius + 0.1
         knots_x = np.concatenate([[x[0]], obstacles[:, 0], [goal[0]]])
         knots_y = np.concatenate([[x[1]], obstacles[:, 1] + np.array(sides[: len(obstacles)]) * clearance, [goal[1]]])
@@ -196,7 +195,7 @@ class Weave(BallbotTask):
         return then_stay(np.column_stack([along, catmull_rom(knots_x, knots_y, along)]), self.steps)
 
     def passed_obstacles(self, c: np.ndarray) -> np.ndarray:
-        _, obstacles = split_constants(c)
+        _, obstacles = self.split_constants(c)
         return obstacles + [0.0, 0.0, self.ball_radius]
 
     def without_obstacles(self, c: np.ndarray) -> np.ndarray:
@@ -214,13 +213,13 @@ class Weave(BallbotTask):
         return scaled(tuple(parts), self.observation_scale, like=x)
 
     def markers(self, c: np.ndarray) -> list[Marker]:
-        goal, obstacles = split_constants(c)
+        goal, obstacles = self.split_constants(c)
         posts = [Marker((x, y), radius, 0.25, (0.75, 0.1, 0.15, 1.0)) for x, y, radius in obstacles.tolist()]
         return [*posts, Marker((float(goal[0]), float(goal[1])), 0.3, 0.01, (0.1, 0.6, 0.3, 1.0))]
 
-
-def split_constants(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Goal (2,) and the distinct obstacles (n, 3): x, y, radius, m, in the order of their numbers."""
-    obstacles = np.asarray(c[2:]).reshape(MAX_OBSTACLES, 3)
-    distinct = [i for i in range(MAX_OBSTACLES) if i == 0 or not (obstacles[i] == obstacles[i - 1]).all()]
-    return np.asarray(c[:2]), obstacles[distinct]
+    @staticmethod
+    def split_constants(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Goal (2,) and the distinct obstacles (n, 3): x, y, radius, m, in the order of their numbers."""
+        obstacles = np.asarray(c[2:]).reshape(MAX_OBSTACLES, 3)
+        distinct = [i for i in range(MAX_OBSTACLES) if i == 0 or not (obstacles[i] == obstacles[i - 1]).all()]
+        return np.asarray(c[:2]), obstacles[distinct]

@@ -25,7 +25,6 @@ from ballbot_gym.robot import (
     Randomization,
     Robot,
     Sensors,
-    checked_randomization,
 )
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
@@ -151,7 +150,7 @@ class BallbotBatch:
         self.params = robot_of(task, robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.limit_names = limit_names(self.task, self.params)
-        self.randomization, self.history = checked_randomization(randomization, self.params), check_history(history)
+        self.randomization, self.history = Randomization.checked(randomization, self.params), check_history(history)
         self.observation = check_observation(observation, self.params, self.randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None

@@ -28,7 +28,7 @@ from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task, robot_of
 from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
-from ballbot_gym.robot import PAPER, Randomization, Robot, checked_randomization
+from ballbot_gym.robot import PAPER, Randomization, Robot
 from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.arrays import BallbotArrays
@@ -341,7 +341,7 @@ def _without_torch(
         ModuleNotFoundError: an argument asks for what torch alone computes.
         ValueError: as `BallbotVectorEnv`.
     """
-    varied = checked_randomization(randomization, params)
+    varied = Randomization.checked(randomization, params)
     plain = (
         varied == Randomization()
         and not check_history(history)

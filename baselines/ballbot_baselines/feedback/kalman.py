@@ -23,7 +23,7 @@ import numpy as np
 
 from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robot import ROBOT_FACTORS, Randomization, Robot, Sensors, substeps_for
+from ballbot_gym.robot import ROBOT_FACTORS, Randomization, Robot, Sensors
 from ballbot_gym.step import observation_space
 from ballbot_gym.tasks import Task
 
@@ -141,7 +141,7 @@ class TrackFilter:
         for age in range(self._delays[-1], 0, -1):  # of commands that have not begun to act, the earliest first
             if (waits := self.delay >= age).any():
                 forces = share * self._commands[age - 1]
-                after = robot.step(x, forces, self._dt, substeps_for(self._dt))
+                after = robot.step(x, forces, self._dt, robot.substeps(self._dt))
                 x = np.where(waits[..., None], after, x)
         return x
 
@@ -160,7 +160,7 @@ def _step_function(params: Robot, dt: float) -> casadi.Function:
     z, u = casadi.SX.sym("z", _SIZE), casadi.SX.sym("u", 2)
     mass, height, force = (z[8 + i] for i in range(3))
     robot = Randomization().robot(params, (mass, 1.0, height, 1.0))
-    x = robot.step(z[_X], force * u, dt, substeps_for(dt))
+    x = robot.step(z[_X], force * u, dt, robot.substeps(dt))
     slopes = casadi.vec(casadi.densify(casadi.jacobian(x, z)))
     return in_lanes("filter", (casadi.Function("step", [z, u], [x, slopes], {"cse": True}),))[0]
 
@@ -299,7 +299,7 @@ def _control_step(params: Robot, dt: float) -> tuple[casadi.Function, casadi.Fun
     """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `Sensors.mean` gives of it. Each gives
     its Jacobian with respect to x too.
     """
-    model, substeps = _robot_and_sensors(params), substeps_for(dt)
+    model, substeps = _robot_and_sensors(params), params.substeps(dt)
     x, u, own = casadi.MX.sym("x", 11), casadi.MX.sym("u", 3), casadi.DM.eye(11)
     after, slopes, h = x, own, dt / substeps
     for _ in range(substeps):

@@ -6,7 +6,7 @@ import numpy as np
 
 from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_baselines.solvers.riccati import Gains, discrete_lqr, lqr_at_end
-from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Reference, Task
 
@@ -109,7 +109,7 @@ def _feedforward(model: LinearQuadratic, gains: Gains) -> np.ndarray:
     x, u, dt = model.x, model.u, model.task.control_dt
     (a, b), (_, r), (of_x, of_u) = model.dynamics, model.costs, model.cost_slopes
     missed = np.zeros_like(x)
-    missed[:-1] = model.params.step(x, u, dt, substeps_for(dt))[:-1] - x[1:]
+    missed[:-1] = model.params.step(x, u, dt, model.params.substeps(dt))[:-1] - x[1:]
     forces = np.zeros_like(u)
     slope = np.zeros(x.shape[1])  # half the slope of the cost-to-go, which is xᵀPx + 2 slopeᵀx
     for i in reversed(range(len(x))):

@@ -32,7 +32,7 @@ from ballbot_baselines.optimum.find import plan_to_track
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_baselines.solvers.shooting import Backoff
-from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
@@ -181,7 +181,7 @@ class NmpcController:
         if self.disturbance is None or self._before is None or not np.isfinite(x).all():
             return
         dt = self._task.control_dt
-        expected = self._params.step(*self._before, dt, substeps_for(dt))
+        expected = self._params.step(*self._before, dt, self._params.substeps(dt))
         self.disturbance.fit(*self._before, (x - expected)[4:] / dt)
 
     def _found_new_plan(self, t: float, x: np.ndarray) -> bool:

@@ -20,7 +20,7 @@ from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, Randomization, Robot, checked_robot, substeps_for
+from ballbot_gym.robot import PAPER, Randomization, Robot, checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -137,7 +137,7 @@ def optimum_of(
     for k in range(delay):
         began = task.at(c, k * dt)
         cost += dt * float(task.cost(states[-1], none, began))
-        states.append(np.array(params.step(states[-1], none, dt, substeps_for(dt))))
+        states.append(np.array(params.step(states[-1], none, dt, params.substeps(dt))))
         violated = task.violated(states[-1], task.at(c, (k + 1) * dt))
         if violated or min(params.limits(states[-2], none, hold=dt), default=1.0) < 0:
             raise PlanError(f"{task.id}: the limit of {violated or 'grip'} is violated before the first force can act")

@@ -23,7 +23,6 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared
 from ballbot_gym.robot import Ballbot
 from ballbot_gym.rollout import Episode, rollout, simulate
-from ballbot_gym.tasks.orbit import steady_orbit
 from ballbot_gym.tasks.paths import cubic
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
@@ -176,7 +175,7 @@ def _along(params: Ballbot, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, du
 
 def _orbit_guess(params: Ballbot, speed: float, radius: float) -> Trajectory:
     bearings = np.pi / 2 + np.linspace(0, 2 * np.pi, INTERVALS + 1)
-    x, u = steady_orbit(params, radius, speed, bearings)
+    x, u = params.steady_orbit(radius, speed, bearings)
     return Trajectory(2 * np.pi * radius / speed / INTERVALS * np.arange(len(x)), x, u)
 
 

@@ -30,7 +30,7 @@ from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_baselines.solvers.shooting import ocp_of
 from ballbot_gym import machine_code, ops
 from ballbot_gym.machine_code import codegen
-from ballbot_gym.robot import Kind, Robot, substeps_for
+from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
@@ -252,7 +252,7 @@ class _Stage:
 
     def __init__(self, task: Task, kind: Kind, free_time: bool, rests: bool):
         self._ocp = ocp_of(task, kind, free_time)
-        self._substeps = substeps_for(task.control_dt)
+        self._substeps = kind.robot.substeps(task.control_dt)
         self._free, self.ns, self._rests = free_time, 9 if free_time else 8, rests
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")

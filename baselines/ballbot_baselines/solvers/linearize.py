@@ -6,7 +6,7 @@ from functools import cache, cached_property, lru_cache
 import casadi
 import numpy as np
 
-from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -96,7 +96,7 @@ class LinearQuadratic:
 def _jacobians(params: Robot, dt: float) -> casadi.Function:
     """Of the state after a control step of dt, s."""
     x, u = casadi.SX.sym("x", params.state_size), casadi.SX.sym("u", params.action_size)
-    out = params.step(x, u, dt, substeps_for(dt))
+    out = params.step(x, u, dt, params.substeps(dt))
     outputs = [casadi.densify(casadi.jacobian(out, x)), casadi.densify(casadi.jacobian(out, u))]
     return casadi.Function("jacobians", [x, u], outputs, {"cse": True})
 

@@ -19,7 +19,6 @@ import numpy as np
 from ballbot_baselines.solvers import guess
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
-from ballbot_gym.robot import substeps_for
 from ballbot_gym.tasks import Task
 
 _LEAN_BANDWIDTHS = (7.0, 10.0, 14.0)  # rad/s, of the lean's loop
@@ -114,7 +113,7 @@ def _simulated(
         u = np.stack(steering(params, tuple(x.T), leaning, bandwidth, seconds, target, force), -1)
         u = params.turning_ball(x, u).clip(-params.force_limit, params.force_limit)
         forces.append(u)
-        x = params.step(x, u, dt, substeps_for(dt))
+        x = params.step(x, u, dt, params.substeps(dt))
         states.append(x)
     return np.array(states), np.array(forces)
 

@@ -19,7 +19,7 @@ from ballbot_baselines.solvers import guess
 from ballbot_baselines.solvers.formulas import check_formulas
 from ballbot_baselines.solvers.ocp import Ocp, OcpSolver, Solution
 from ballbot_gym.ops import is_number
-from ballbot_gym.robot import Kind, Robot, substeps_for
+from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.tasks import Task
 
 BARRIER = 0.1
@@ -116,7 +116,7 @@ def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
         (x, length, c), (_, limit) = of_stage(s, p), robot_of(p)
         return task.cost(x, limit * a, c) * length
 
-    substeps = 2 if free_time else substeps_for(task.control_dt)
+    substeps = 2 if free_time else kind.robot.substeps(task.control_dt)
     return Ocp(
         name=f"{task.id}-free-time" if free_time else task.id,
         states=n + free_time,

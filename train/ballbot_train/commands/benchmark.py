@@ -5,7 +5,7 @@ from typing import Any
 
 from ballbot_gym import certified, files
 from ballbot_gym.registry import own_robot
-from ballbot_gym.robot import PAPER, Ballbot, checked_randomization, named_robot
+from ballbot_gym.robot import PAPER, Ballbot, Randomization, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness
@@ -55,7 +55,7 @@ def benchmark(
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:
         for track in randomization:
-            checked_randomization(track)
+            Randomization.checked(track)
         settings["tracks"] = list(randomization)
     facts = open_run(out, workers, made_for, robot, **settings)
     if randomization:

@@ -9,7 +9,7 @@ from ballbot_baselines.optimum import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.registry import own_robot
-from ballbot_gym.robot import PAPER, checked_randomization, named_robot, robot_setting
+from ballbot_gym.robot import PAPER, Randomization, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
@@ -53,7 +53,7 @@ def certify(
     check_least(1, episodes=episodes, **({} if trajectories is None else {"trajectories": trajectories}))
     if shards is None and episodes > _MOST_EPISODES:
         raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}; or give --shards")
-    varied = checked_randomization(randomization)
+    varied = Randomization.checked(randomization)
     if randomization and not varied.moves_optima:
         raise ValueError(
             f"{randomization} changes no optimum, so its episodes have the usual optima; leave out --randomization"

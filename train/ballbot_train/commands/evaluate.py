@@ -9,7 +9,7 @@ from typing import Any
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.registry import own_robot
-from ballbot_gym.robot import PAPER, Randomization, checked_randomization, file_name, track_of
+from ballbot_gym.robot import PAPER, Randomization, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation.controllers import behind, controllers_of, make_controller, policy_digests, task_name
@@ -71,7 +71,7 @@ def evaluate(
         randomization: name of a track, whose robots, delays and sensor errors are hidden from the policy.
         filter: filter in front of the policy: it estimates the robot, the delay, or the state from sensors.
     """
-    varied = checked_randomization(randomization)
+    varied = Randomization.checked(randomization)
     robot = robot if task is None else own_robot(task, robot)
     task, policy = task_name(policy, task, robot), behind(policy, filter)
     chosen = controllers_of([task], [policy], [robot])
@@ -124,7 +124,7 @@ def _evaluate_fresh(
 
         check_searchable(make_task(task, robot), varied)
     jobs.make_folder(out)
-    of = {"task": task, "policy": policy, "robot": robot, "randomization": track_of(varied)}
+    of = {"task": task, "policy": policy, "robot": robot, "randomization": varied.track}
     if (out / "fresh.json").exists():  # of the same policy they are replaced
         about = files.read_json(out / "fresh.json").get("about")
         held = {name: about.get(name, of[name]) for name in of} if isinstance(about, dict) else {}

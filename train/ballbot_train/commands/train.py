@@ -10,7 +10,7 @@ from typing import Annotated, Any, cast
 
 from ballbot_gym import certified
 from ballbot_gym.registry import own_robot
-from ballbot_gym.robot import PAPER, checked_randomization, file_name, named_robot, robot_setting
+from ballbot_gym.robot import PAPER, Randomization, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import UNNAMED
 from ballbot_train.learning import VALIDATION_EPISODES
@@ -94,7 +94,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
 
     torch.set_num_threads(run.threads)
     problem, params, out = make_task(run.task, run.robot), named_robot(run.robot), cast(Path, run.out)
-    varied = checked_randomization(run.randomization)
+    varied = Randomization.checked(run.randomization)
     given = None if run.randomization is None else varied, run.history, run.informed
     LEARNERS[learner].check(problem, params, run.demos, run.start, *given)
     config = _config(learner, run, settings, command)

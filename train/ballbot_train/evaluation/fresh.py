@@ -25,7 +25,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.registry import name_of
-from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
+from ballbot_gym.robot import PAPER, Randomization, named_robot
 from ballbot_gym.rollout import ActionController, Controller, PlanError
 from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import Task
@@ -432,7 +432,7 @@ def evaluate_fresh(
     Raises:
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
     """
-    task, params, varied = make_task(task, robot), named_robot(robot), checked_randomization(randomization)
+    task, params, varied = make_task(task, robot), named_robot(robot), Randomization.checked(randomization)
     check_fresh(policy, task, episodes, seed, robot)
     numbers = [range(episodes)[start : start + _BATCH] for start in range(0, episodes, _BATCH)]
     problem = (policy, task, robot, varied, seed)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.engines import make_simulator
-from ballbot_gym.robot import Robot, substeps_for
+from ballbot_gym.robot import Robot
 from ballbot_gym.step import limit_names, outcome
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import recordings
@@ -128,7 +128,7 @@ def stepped(
     """The states (n, 8) one control step after others, and how fast a rolling ball then slips (n,), m/s."""
     dt, slip = task.control_dt, np.zeros(len(before))
     if physics == "rk4":
-        return robot.step(before, force, dt, substeps_for(dt)), slip
+        return robot.step(before, force, dt, robot.substeps(dt)), slip
     simulator, reached = make_simulator(physics, robot, dt), np.empty_like(before)
     try:
         for i, (x, u) in enumerate(zip(before.tolist(), force.tolist(), strict=True)):

@@ -30,7 +30,7 @@ import torch
 
 from ballbot_baselines import Backoff, Optimum, find_optima, find_optimum
 from ballbot_baselines.feedback.trajopt import EXECUTED
-from ballbot_gym.robot import Randomization, Robot, registered_name, substeps_for
+from ballbot_gym.robot import Randomization, Robot, registered_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.paths import sides_passed
@@ -402,7 +402,7 @@ class Dagger:
         robot = batch.model(state.drawn.unbind(0))
         for age in range(len(commands), 0, -1):
             dt = self._task.control_dt
-            later = robot.step(x, commands[age - 1].unbind(0), dt, substeps_for(dt))
+            later = robot.step(x, commands[age - 1].unbind(0), dt, robot.substeps(dt))
             x = tuple(torch.where(state.drawn[5] >= age, new, old) for new, old in zip(later, x, strict=True))
         return torch.stack(x, 1).double().numpy()
 

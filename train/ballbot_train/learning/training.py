@@ -47,7 +47,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robot import PAPER, Randomization, checked_randomization, named_robot
+from ballbot_gym.robot import PAPER, Randomization, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import digest, problem_parts
 from ballbot_train.evaluation import fresh, runner
@@ -221,7 +221,7 @@ class _Run:
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
         self.rows: list[dict[str, Any]] = []
         self.robot = self.config.get("robot", PAPER)
-        self.randomization = checked_randomization(self.config.get("randomization"))
+        self.randomization = Randomization.checked(self.config.get("randomization"))
         self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
 
     def restore(self) -> None:

@@ -17,7 +17,7 @@ from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.robot import PAPER, Robot, Sensors, named_robot, substeps_for
+from ballbot_gym.robot import PAPER, Robot, Sensors, named_robot
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.policy.export_onnx import metadata
@@ -140,7 +140,7 @@ def _filter(task: Task, params: Robot) -> dict[str, Any]:
 
     start, deviations = sensor_filter.expected_start(np.zeros(0))
     return {
-        "substeps": substeps_for(task.control_dt),
+        "substeps": params.substeps(task.control_dt),
         "start": start,
         "start_variance": deviations**2,
         "model_variance": sensor_filter.model_variance,

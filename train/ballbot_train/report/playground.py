@@ -20,7 +20,7 @@ from ballbot_baselines import LqrController
 from ballbot_gym import certified, drawing
 from ballbot_gym.drawing import page
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import TRACKS, Randomization, Robot, default_params, substeps_for
+from ballbot_gym.robot import TRACKS, Randomization, Robot, default_params
 from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import policy_path, task_name
@@ -186,7 +186,7 @@ def _scenario_data(scenario: _Scenario, episode: int | None, params: Robot) -> d
 def _model_script(params: Robot, networks: Mapping[str, PolicyNetwork]) -> str:
     """The functions `step` and `push`, of a robot with the factors `_UNKNOWN`, and `MODELS`: those of every shipped task."""
     dt = make_task("stabilize").control_dt
-    substeps = substeps_for(dt)
+    substeps = params.substeps(dt)
 
     def robot(factors: casadi.SX) -> Robot:
         given: dict[str, Any] = dict(zip(_UNKNOWN, casadi.vertsplit(factors), strict=True))

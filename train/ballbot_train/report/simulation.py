@@ -16,7 +16,7 @@ from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, Drawn, GroundPath
 from ballbot_gym.engines import State, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robot import PAPER, ROBOTS, Randomization, checked_randomization, default_params, named_robot, tilt
+from ballbot_gym.robot import PAPER, ROBOTS, Randomization, default_params, named_robot, tilt
 from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import is_expert, make_controller, names
@@ -211,7 +211,7 @@ class Playground:
         """What went wrong last, in words."""
         self.episode: Start = episode
         self._rng = np.random.default_rng(seed)
-        self._track = checked_randomization(randomization)
+        self._track = Randomization.checked(randomization)
         self._physics = default_physics() if physics is None else physics
         world = _World(task, robot)
         self._open(world, [world.best if controller is None else controller, *ghosts])
