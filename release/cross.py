@@ -72,17 +72,17 @@ def zig(*arguments: str) -> None:
         sys.exit(f"zig cc {' '.join(arguments)}\n{done.stderr[-3000:]}")
 
 
-def compile_for(target: str, codes: list[generated.Code], folder: Path) -> None:
+def compile_for(target: str, codes: list[machine_code.Code], folder: Path) -> None:
     """Compiles all code to shared libraries for a target."""
     suffix = ".dll" if "windows" in target else ".so"
     position = [] if "windows" in target else ["-fPIC"]
     for code in codes:
-        path = folder / f"{code.stem}.c"
+        path = folder / f"{code.stem()}.c"
         path.write_text(code.source, encoding="utf-8")
-        flags = [flag for flag in machine_code.without_parameters(code.flags) if not flag.startswith("-O")]
-        built = ["-c", "-o", str(folder / f"{code.stem}.o")]
+        flags = [flag for flag in code.portable_flags if not flag.startswith("-O")]
+        built = ["-c", "-o", str(folder / f"{code.stem()}.o")]
         if code is codes[0]:  # one is linked: the others have no other undefined names
-            built = ["-shared", *([] if "windows" in target else ["-lm"]), "-o", str(folder / f"{code.stem}{suffix}")]
+            built = ["-shared", *([] if "windows" in target else ["-lm"]), "-o", str(folder / f"{code.stem()}{suffix}")]
         zig("-target", target, "-O1", *flags, *_WARNINGS, *_EXPECTED, *position, str(path), *built)
     print(f"{target}: {len(codes)} libraries without a warning", flush=True)
 

@@ -10,7 +10,6 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
 from ballbot_gym import BallbotEnv, BallbotVectorEnv, machine_code, rollout
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.env import make_task
-from ballbot_gym.machine_code import codegen
+from ballbot_gym.machine_code import Code, codegen
 from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
@@ -31,21 +30,6 @@ EXPERTS = ("nmpc", "trajopt")
 """The experts that compile something; LQR compiles nothing."""
 
 _BATCH = 8  # episodes whose optima are found at once
-
-
-@dataclass(frozen=True)
-class Code:
-    """C code that was compiled."""
-
-    name: str
-    """What its library is called."""
-    source: str
-    flags: tuple[str, ...]
-
-    @property
-    def stem(self) -> str:
-        """The name of its library, without the digest of the library's content."""
-        return f"{self.name}-{machine_code.content_key(self.source, self.flags)}"
 
 
 @contextmanager
@@ -126,8 +110,8 @@ def write(codes: Iterator[Code], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
     for code in codes:
-        (folder / f"{code.stem}.c").write_text(code.source, encoding="utf-8")
-        listed.append({"name": code.name, "file": f"{code.stem}.c", "flags": code.flags})
+        (folder / f"{code.stem()}.c").write_text(code.source, encoding="utf-8")
+        listed.append({"name": code.name, "file": f"{code.stem()}.c", "flags": code.flags})
     (folder / "codes.json").write_text(json.dumps(listed, indent=1), encoding="utf-8")
 
 

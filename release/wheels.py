@@ -35,7 +35,7 @@ def levels() -> tuple[str, ...]:
     return tuple(level for level in machine_code.LEVELS if level.startswith(family))
 
 
-def compile_all(codes: list[generated.Code], folder: Path) -> None:
+def compile_all(codes: list[machine_code.Code], folder: Path) -> None:
     """Compiles all code for every level of this machine's family, unless a library of it is there already."""
     program = machine_code.compiler()
     if program is None:
@@ -43,16 +43,11 @@ def compile_all(codes: list[generated.Code], folder: Path) -> None:
     os.environ.setdefault("MACOSX_DEPLOYMENT_TARGET", _MACOS)
     for level in levels():
         (folder / level).mkdir(parents=True, exist_ok=True)
-        made = {path.stem.rpartition("-")[0]: path for path in (folder / level).iterdir()}
+        made = {path.stem.rpartition("-")[0]: path for path in (folder / level).glob(f"*{machine_code.SUFFIX}")}
         for code in codes:
-            if code.stem in made:
-                continue
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:
-                built = Path(scratch) / f"code{machine_code.SUFFIX}"
-                flags = (*code.flags, *LEVEL_FLAGS[level])
-                machine_code.compile_library(program, code.source, built, flags, waits=True)
-                machine_code.kept(built, folder / level, code.stem)
-        for stem in made.keys() - {code.stem for code in codes}:
+            if code.stem() not in made:
+                code.build(program, folder / level, code.stem(), LEVEL_FLAGS[level])
+        for stem in made.keys() - {code.stem() for code in codes}:
             made[stem].unlink()
         print(f"{level}: {len(codes)} libraries", flush=True)
 

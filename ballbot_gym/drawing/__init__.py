@@ -6,11 +6,10 @@ depends on a graphics library.
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from ballbot_gym.robot import Robot
+from ballbot_gym.robot import Ballbot, Robot
 from ballbot_gym.robot.shapes import DARK
 from ballbot_gym.tasks.marker import Marker
 
@@ -85,37 +84,22 @@ class Drawing:
         """The other markers."""
         return tuple(marker for marker in self.markers if not marker.ring)
 
+    def arrows(self, robot: Drawn) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
+        """Colour, and start and end (3,), m, of the arrows of a ballbot's force and push, where there is one to draw.
 
-class Pose(NamedTuple):
-    """Where a ballbot's parts are, m. The body is a cylinder about the axis from `body` to `top`."""
-
-    ball: np.ndarray
-    """(3,) centre of the ball."""
-    body: np.ndarray
-    """(3,) centre of the body."""
-    top: np.ndarray
-    """(3,) upper end of the body."""
-
-
-def pose(params: Any, x: np.ndarray) -> Pose:
-    """The pose of a ballbot in state x (8,). γ turns the body about the y axis, then θ about the turned −x axis."""
-    ball, axis = params.placed(x)
-    body = ball + params.com_height * axis
-    return Pose(ball, body, body + params.body_length / 2 * axis)
-
-
-def arrows(place: Pose, robot: Drawn) -> list[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-    """Colour, and start and end (3,), m, of the arrows of a robot's force and push, where there is one to draw.
-
-    The force's arrow starts at the ball's centre, and the push's at the body's centre of mass; see `pose`. The forces of
-    three wheels have no common direction, so they get no arrow.
-    """
-    drawn = ((FORCE, robot.u, FORCE_SCALE, LEAST_FORCE, place.ball), (PUSH, robot.push, PUSH_SCALE, 0.0, place.body))
-    return [
-        (color, (at, at + scale * np.array([*part, 0.0])))
-        for color, part, scale, least, at in drawn
-        if part is not None and len(part) == 2 and math.hypot(*part) > least
-    ]
+        The force's arrow starts at the ball's centre, and the push's at the body's centre of mass. The forces of three wheels
+        have no common direction, so they get no arrow.
+        """
+        if not isinstance(self.params, Ballbot):
+            return []
+        ball, axis = self.params.placed(robot.x)
+        body = ball + self.params.com_height * axis
+        drawn = ((FORCE, robot.u, FORCE_SCALE, LEAST_FORCE, ball), (PUSH, robot.push, PUSH_SCALE, 0.0, body))
+        return [
+            (color, (at, at + scale * np.array([*part, 0.0])))
+            for color, part, scale, least, at in drawn
+            if part is not None and len(part) == 2 and math.hypot(*part) > least
+        ]
 
 
 def _ring(marker: Marker) -> np.ndarray:

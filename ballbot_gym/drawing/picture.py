@@ -6,13 +6,12 @@ painted twice as large and then halved, so that edges are smooth.
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw
 
-from ballbot_gym.drawing import Drawing, Drawn, GroundPath, arrows, pose
-from ballbot_gym.robot import Ballbot, Robot, Sphere
+from ballbot_gym.drawing import Drawing, Drawn, GroundPath
+from ballbot_gym.robot import Robot, Sphere
 from ballbot_gym.tasks.marker import Marker
 
 YAW = math.radians(-55)
@@ -95,7 +94,7 @@ class _Painter:
         self._paint_shadows(bodies)
         for robot, (solids, alpha) in zip(robots, bodies, strict=False):
             if alpha == 1 and (robot.u is not None or robot.push is not None):
-                solids += _arrows(self._drawing.params, robot)
+                solids += _arrows(self._drawing, robot)
         for solids, alpha in sorted(bodies, key=lambda body: -self._pixels(body[0][0][0].mean(axis=(0, 1)))[1]):
             self._paint_solids(solids, alpha)
         return np.asarray(self._image.reduce(_FINE))
@@ -185,12 +184,9 @@ def _robot(params: Robot, robot: Drawn) -> list[_Solid]:
     return solids
 
 
-def _arrows(params: Any, robot: Drawn) -> list[_Solid]:
-    """Those of a ballbot's force and push."""
+def _arrows(drawing: Drawing, robot: Drawn) -> list[_Solid]:
     solids = []
-    if not isinstance(params, Ballbot):
-        return solids
-    for color, (start, end) in arrows(pose(params, robot.x), robot):
+    for color, (start, end) in drawing.arrows(robot):
         neck = end - min(_HEAD_LENGTH / float(np.linalg.norm(end - start)), 0.9) * (end - start)
         solids += [(_placed(_CYLINDER, start, neck, _ARROW), color), (_placed(_CONE, neck, end, _HEAD), color)]
     return solids

@@ -18,7 +18,6 @@ __all__ = [
     "PHYSICS_NAMES",
     "Simulator",
     "State",
-    "check_installed",
     "checked_physics",
     "default_physics",
     "installed_physics",
@@ -57,21 +56,18 @@ def checked_physics(physics: Any, params: Robot | None = None) -> str:
 
     Raises:
         ValueError: no physics of that name.
+        ImportError: this machine cannot run it; the message says how to get it.
     """
     if physics is None:
         return default_physics(params)
     name = PHYSICS_ALIASES.get(physics, physics) if isinstance(physics, str) else physics
     if not isinstance(name, str) or name not in PHYSICS:
         raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
-    return name
-
-
-def check_installed(physics: str) -> None:
-    """Raises an ImportError that says how to get a physics that this machine cannot run."""
-    if physics == "bullet":
+    if name == "bullet":
         import_pybullet()
-    elif physics == "mujoco":
+    elif name == "mujoco":
         mujoco.import_mujoco()
+    return name
 
 
 def default_physics(params: Robot | None = None) -> str:

@@ -6,29 +6,23 @@
 from ballbot_gym.machine_code.libraries import (
     LEVELS,
     SUFFIX,
+    Code,
     NoMachineCodeError,
     cache_folder,
     check_private,
-    compile_library,
     compiler,
-    content_key,
-    kept,
     library,
     shipped_source,
-    without_parameters,
 )
 
 __all__ = [
     "LEVELS",
     "SUFFIX",
+    "Code",
     "NoMachineCodeError",
     "cache_folder",
     "check_private",
-    "compile_library",
     "compiler",
-    "content_key",
-    "kept",
     "library",
     "shipped_source",
-    "without_parameters",
 ]

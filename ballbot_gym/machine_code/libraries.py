@@ -13,6 +13,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -44,6 +45,54 @@ class NoMachineCodeError(RuntimeError):
     """C code cannot be compiled here; the message says why. It is empty where the log has said so already."""
 
 
+@dataclass(frozen=True)
+class Code:
+    """C code of a shared library."""
+
+    name: str
+    """What the library is called, for humans who look into a folder of them."""
+    source: str
+    flags: tuple[str, ...]
+    """Of the compiler, besides those that every library needs."""
+
+    def stem(self, *machine: str) -> str:
+        """The name of its library for a machine, without the digest of the library's content."""
+        content = "\0".join([self.source, *machine, *self.flags])
+        return f"{self.name}-{hashlib.sha256(content.encode()).hexdigest()[:_DIGITS]}"
+
+    @property
+    def portable_flags(self) -> tuple[str, ...]:
+        """The flags without GCC's `--param NAME=VALUE`, which other compilers refuse."""
+        pairs = zip(("", *self.flags), self.flags, strict=False)
+        return tuple(flag for before, flag in pairs if "--param" not in (before, flag))
+
+    def build(
+        self, compiler: str, folder: Path, stem: str, extra: tuple[str, ...] = (), seconds: float | None = None
+    ) -> Path:
+        """Compiles it to a library in a folder.
+
+        That is done in a folder of its own, and then renamed: two processes at once, or a kill, never leave half a library.
+
+        Args:
+            compiler: the program.
+            folder: where the library is kept.
+            stem: the library's name, to which the digest of its content is added.
+            extra: further flags.
+            seconds: after which the compiler counts as hanging; default, it is waited for.
+
+        Raises:
+            subprocess.CalledProcessError: the compiler refuses the code or a flag.
+            subprocess.TimeoutExpired: it hangs.
+        """
+        flags = self.flags if _is_gcc(compiler) else self.portable_flags
+        # inside the folder, because a rename is atomic within one file system only
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
+            code, built = Path(scratch) / "code.c", Path(scratch) / f"code{SUFFIX}"
+            code.write_text(self.source, encoding="utf-8")
+            _run([compiler, *flags, *extra, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES], seconds, check=True)
+            return _kept(built, folder, stem)
+
+
 def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
     """The shared library of C code.
 
@@ -56,7 +105,8 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
         NoMachineCodeError: it cannot be compiled.
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
-    if (shipped := _shipped(name, source, flags)) is not None:
+    code = Code(name, source, flags)
+    if (shipped := _shipped(code)) is not None:
         return shipped
     program = compiler()
     if program is None or program in _hanging:
@@ -64,8 +114,8 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
     try:
         folder = cache_folder()
         _make_private(folder)
-        key = content_key(source, flags, _machine(program), _NATIVE, *_FLAGS)
-        return _whole(folder, f"{name}-{key}", own=True) or _build(program, source, folder, f"{name}-{key}", flags)
+        stem = code.stem(_machine(program), _NATIVE, *_FLAGS)
+        return _whole(folder, stem, own=True) or _compiled(code, program, folder, stem)
     except subprocess.CalledProcessError as error:
         raise NoMachineCodeError(f"{program} failed: {error.stderr.strip()[-300:]}") from error
     except subprocess.TimeoutExpired as error:
@@ -76,11 +126,6 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
     except (OSError, RuntimeError) as error:
         # a program that cannot be run, no home, or a folder that cannot be written
         raise NoMachineCodeError(str(error)[-300:]) from error
-
-
-def content_key(source: str, flags: tuple[str, ...], *machine: str) -> str:
-    """Digits that tell C code and the flags of its compilation, for a machine, from all others."""
-    return hashlib.sha256("\0".join([source, *machine, *flags]).encode()).hexdigest()[:_DIGITS]
 
 
 def cache_folder() -> Path:
@@ -129,49 +174,16 @@ def check_private(path: Path, variable: str) -> None:
         raise PermissionError(f'others may write into {path}; run "chmod go-w" on it')
 
 
-def _build(compiler: str, source: str, folder: Path, stem: str, flags: tuple[str, ...]) -> Path:
-    """Compiles into a folder of its own, then renames: two processes at once, or a kill, never leave half a library."""
-    _log.info("compiling %s, once on this machine", stem.rpartition("-")[0])
-    # inside the cache, because a rename is atomic within one file system only
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
-        built = Path(scratch) / f"code{SUFFIX}"
-        try:
-            compile_library(compiler, source, built, (*flags, _NATIVE))
-        except subprocess.CalledProcessError:
-            compile_library(compiler, source, built, flags)
-        return kept(built, folder, stem)
+def _compiled(code: Code, compiler: str, folder: Path, stem: str) -> Path:
+    """The library of that name, compiled for this very processor if the compiler can do that."""
+    _log.info("compiling %s, once on this machine", code.name)
+    try:
+        return code.build(compiler, folder, stem, (_NATIVE,), _COMPILE_SECONDS)
+    except subprocess.CalledProcessError:
+        return code.build(compiler, folder, stem, (), _COMPILE_SECONDS)
 
 
-def compile_library(compiler: str, source: str, built: Path, flags: tuple[str, ...], waits: bool = False) -> None:
-    """Compiles C code to the shared library `built`. The code is saved in the same folder.
-
-    Args:
-        compiler: the program.
-        source: the code.
-        built: where the library is written.
-        flags: of the compiler, besides those that every library needs.
-        waits: for as long as it takes; default, a compiler that takes minutes counts as hanging.
-
-    Raises:
-        subprocess.CalledProcessError: the compiler refuses the code or a flag.
-        subprocess.TimeoutExpired: it hangs.
-    """
-    code = built.with_suffix(".c")
-    code.write_text(source, encoding="utf-8")
-    own = flags if _is_gcc(compiler) else without_parameters(flags)
-    _run(
-        [compiler, *own, *_FLAGS, str(code), "-o", str(built), *_LIBRARIES],
-        None if waits else _COMPILE_SECONDS,
-        check=True,
-    )
-
-
-def without_parameters(flags: tuple[str, ...]) -> tuple[str, ...]:
-    """Flags without GCC's `--param NAME=VALUE`, which other compilers refuse."""
-    return tuple(flag for before, flag in zip(("", *flags), flags, strict=False) if "--param" not in (before, flag))
-
-
-def kept(built: Path, folder: Path, stem: str) -> Path:
+def _kept(built: Path, folder: Path, stem: str) -> Path:
     """Renames a library into a folder. Its name ends with a digest of its content, so that damage is noticed.
 
     A digest inside of the file would break its signature, which macOS asks for.
@@ -192,12 +204,11 @@ def _run(command: list[str], seconds: float | None, check: bool) -> str:
     ).stdout
 
 
-def _shipped(name: str, source: str, flags: tuple[str, ...]) -> Path | None:
+def _shipped(code: Code) -> Path | None:
     """The library that the package contains of this code, of the best level of this processor; None where there is none."""
     if not SHIPPED.is_dir():
         return None
-    stem = f"{name}-{content_key(source, flags)}"
-    found = (_whole(SHIPPED / level, stem, own=False) for level in _levels())
+    found = (_whole(SHIPPED / level, code.stem(), own=False) for level in _levels())
     return next((path for path in found if path is not None), None)
 
 

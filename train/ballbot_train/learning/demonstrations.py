@@ -40,7 +40,7 @@ from minari.dataset.minari_dataset import parse_dataset_id
 from ballbot_baselines import CONTROLLERS, Backoff
 from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym import certified, files, seeding
-from ballbot_gym.engines import check_installed, default_physics
+from ballbot_gym.engines import checked_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Robot, named_robot
@@ -82,9 +82,7 @@ class DemoConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", own_robot(self.task, self.robot))
-        if self.physics is None:
-            object.__setattr__(self, "physics", default_physics(named_robot(self.robot)))
-        check_installed(cast(str, self.physics))
+        object.__setattr__(self, "physics", checked_physics(self.physics, named_robot(self.robot)))
         task = make_task(self.task, self.robot)
         check_names("expert", [self.expert], controllers.names(task, self.robot))
         if not 1 <= self.episodes <= _MOST_EPISODES:

@@ -122,12 +122,11 @@ def physics_or_default(physics: Physics | None, robot: str = "paper") -> Physics
     Raises:
         ImportError: it is not installed; the message says how to get it.
     """
-    from ballbot_gym.engines import check_installed, default_physics
+    from ballbot_gym.engines import checked_physics, default_physics
     from ballbot_gym.robot import named_robot
 
     if physics is not None:
-        check_installed(physics)
-        return physics
+        return cast(Physics, checked_physics(physics))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         chosen = default_physics(named_robot(robot))
