@@ -29,12 +29,13 @@ from ballbot_gym.machine_code.single import StepCode, StepProblem
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robot import (
     PAPER,
+    ROBOTS,
     Randomization,
     Robot,
     Sensors,
     checked_robot,
     named_robot,
-    own_fields,
+    robot_name,
 )
 from ballbot_gym.step import (
     ENGINE,
@@ -544,7 +545,8 @@ def make_task(task: str | Task, robot: str | Robot = PAPER, /, **task_fields: An
     for name in sorted(task_fields.keys() - set(known)):
         # Python's own words, because clients such as torchrl look for them.
         raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; it has {', '.join(known)}")
-    return TASKS[task](**(own_fields(robot, task) | task_fields))
+    name = robot.rpartition(":")[2] if isinstance(robot, str) else robot_name(robot)
+    return TASKS[task](**(ROBOTS[name].fields.get(task, {}) | task_fields))
 
 
 def robot_of(task: str | Task, robot: Any = PAPER, params: Any = None) -> Robot:

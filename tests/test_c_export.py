@@ -9,8 +9,7 @@ from builders import random_policy, task_and_robot
 
 from ballbot_gym import certified, machine_code
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robot import default_params
-from ballbot_gym.robot.sensors import SCALE
+from ballbot_gym.robot import Sensors, default_params
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import make_controller
@@ -107,7 +106,7 @@ class FromSensors:
         self._begun = False
 
     def act(self, t, x):
-        sensors, place = (part.astype(np.float32) for part in (x[:9] * SCALE, x[9:11]))
+        sensors, place = (part.astype(np.float32) for part in (x[:9] * Sensors.SCALE, x[9:11]))
         pointers = (
             part.ctypes.data_as(ctypes.c_void_p) for part in (sensors, place, self._state, self._seen, self._action)
         )

@@ -190,14 +190,6 @@ def checked_robot(robot: Any, params: Any = None) -> Robot:
     return robot
 
 
-def own_fields(robot: str | Robot, task: str) -> dict[str, float]:
-    """The fields of a task, by name, that a robot has other defaults of."""
-    if isinstance(robot, str):
-        named_robot(robot)  # raises if there is none
-    name = robot.rpartition(":")[2] if isinstance(robot, str) else robot_name(robot)
-    return dict(ROBOTS[name].fields.get(task, {}))
-
-
 register_robot(PAPER, URDF_PATH)
 register_robot(  # the paper's with a ball that rolls, driven by a torque, on a floor with friction 0.8
     "rolling",
