@@ -113,14 +113,6 @@ def check_history(history: Any) -> int:
     return int(history)
 
 
-def check_constant_names(task: Any, named: dict[str, Any]) -> None:
-    """Raises a ValueError that says which constants a task has, where others are given by name."""
-    unknown = sorted(set(named) - set(task.constant_names), key=repr)
-    if unknown:
-        known = list(task.constant_names) or 'none: leave options["constants"] out'
-        raise ValueError(f"{task.id} has no constants {unknown}; it has {known}")
-
-
 _Kind = TypeVar("_Kind", bound=type)
 
 

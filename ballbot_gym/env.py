@@ -13,7 +13,6 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym.checks import (
-    check_constant_names,
     check_history,
     finite_array,
     fixed,
@@ -449,7 +448,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         c = None
         if constants is not None:
             if isinstance(constants, dict):
-                check_constant_names(task, constants)
+                task.check_constant_names(constants)
                 own = task.draw_constants(z[: task.constant_draws], params)
                 constants = [constants.get(name, value) for name, value in zip(task.constant_names, own, strict=True)]
             given = finite_array(constants, (len(task.constant_names),), "constants")

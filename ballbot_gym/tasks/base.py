@@ -213,6 +213,13 @@ class Task(ABC):
     def check_constants(self, c: np.ndarray, params: Any) -> None:
         """Raises a ValueError that names the first invalid constant."""
 
+    def check_constant_names(self, named: dict[str, Any]) -> None:
+        """Raises a ValueError that says which constants the task has, where others are given by name."""
+        unknown = sorted(set(named) - set(self.constant_names), key=repr)
+        if unknown:
+            known = list(self.constant_names) or 'none: leave options["constants"] out'
+            raise ValueError(f"{self.id} has no constants {unknown}; it has {known}")
+
     @abstractmethod
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         """Cost rate, 1/s, ≥ 0: the episode costs its sum over control steps times control_dt."""

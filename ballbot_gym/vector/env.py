@@ -15,7 +15,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ballbot_gym.checks import (
-    check_constant_names,
     check_finite,
     check_history,
     finite_array,
@@ -274,7 +273,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         names, task = self.task.constant_names, self.task
         c = _as_array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
-            check_constant_names(task, constants)
+            task.check_constant_names(constants)
             for name, value in constants.items():
                 c[names.index(name)] = finite_array(value, (self.num_envs,), f"constant {name!r}", broadcast=True)
         else:
