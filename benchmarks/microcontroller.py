@@ -19,7 +19,7 @@ from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, ROBOTS, Sensors, named_robot
 from ballbot_gym.rollout import Controller, rollout
-from ballbot_train.evaluation.controllers import make_controller, policy_path, split
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.export_c import LQR, export_c
 from ballbot_train.policy.printed import c_number
 
@@ -162,9 +162,9 @@ def main(
 
 
 def _measured(task: str, robot: str, name: str, folder: Path) -> Row:
-    problem, (alone, filter) = make_task(task, robot), split(name)
-    filtered = bool(filter)
-    policy = LQR if alone == LQR else policy_path(alone, problem, robot)
+    problem, controller = make_task(task, robot), ControllerName(name)
+    filtered = bool(controller.filter)
+    policy = LQR if controller.alone == LQR else ControllerName(controller.alone).path(problem, robot)
     source = export_c(policy, folder / "controller.c", problem, robot, filtered)
     main = _MAIN % {**_episode(task, robot, name, filtered), "repetitions": _REPETITIONS}
     files.write(folder / "main.c", filtered * "#define FILTERED\n" + main)
@@ -223,7 +223,7 @@ class _Recorded:
 def _episode(task: str, robot: str, name: str, filtered: bool) -> dict[str, str]:
     """Constants of an episode, what the controller was shown in it, in float32, and Python's actions."""
     params = named_robot(robot)
-    controller = _Recorded(make_controller(name, make_task(task, robot), params), filtered)
+    controller = _Recorded(ControllerName(name).make(make_task(task, robot), params), filtered)
     env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors" if filtered else "state")
     c = rollout(env, controller, seed=1).constants.astype(np.float32)
     shown, place = np.array(controller.shown), np.zeros(2)

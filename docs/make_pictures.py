@@ -18,8 +18,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ballbot_gym import files
+from ballbot_gym.env import make_task
+from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation.controllers import controllers_of, policy_digests
+from ballbot_train.evaluation.controllers import ControllerName, controllers_of
 
 PICTURES = Path(__file__).parent / "pictures"
 MADE = PICTURES / "made.json"
@@ -39,7 +41,13 @@ class Make:
 
     def policies(self) -> dict[str, str]:
         """SHA-256 of the weights of the policies that are shipped now, by TASK/NAME."""
-        return policy_digests(controllers_of(self.tasks, self.names)) if self.tasks else {}
+        chosen = controllers_of(self.tasks, self.names)[PAPER] if self.tasks else {}
+        return {
+            f"{task}/{name}": file.weights_digest()
+            for task, names in chosen.items()
+            for name in names
+            if (file := ControllerName(name).file(make_task(task))) is not None
+        }
 
 
 MAKES = [

@@ -12,7 +12,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import Sensors, default_params
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.export import export
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.export_c import LARGEST_ERROR, LQR, export_c
 from ballbot_train.policy.files import SHIPPED
 from ballbot_train.policy.network import PolicyController, save_policy
@@ -67,7 +67,7 @@ class Compiled:
     ],
 )
 def test_a_compiled_controller_drives_certified_episodes_to_the_same_ends(task, name, tmp_path):
-    made = make_controller(name, make_task(task), default_params())
+    made = ControllerName(name).make(make_task(task), default_params())
     export(name, task=task, format="c", out=tmp_path / "controller.c")
     task = make_task(task)
     compiled = Compiled(tmp_path / "controller.c", task, made)
@@ -129,7 +129,7 @@ def test_a_compiled_filter_drives_certified_episodes_from_sensors_to_the_same_en
     assert told.stdout.startswith(b"PASS")
     env = BallbotEnv(robot=robot, physics="rk4", observation="sensors")
     compiled, known = FromSensors(tmp_path / "filtered.c", env.params.force_limit), certified.load(env.task, robot)
-    made, ends = make_controller(name, env.task, env.params), []
+    made, ends = ControllerName(name).make(env.task, env.params), []
     for i in range(episodes):
         driven, own = (rollout(env, each, seed=i, options=known.options(i)) for each in (compiled, made))
         ends.append(driven.success)

@@ -12,7 +12,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.rollout import PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import ControllerName
 
 IDLE = FunctionController(lambda t, x: np.zeros(2))
 UPRIGHT = np.zeros(8)
@@ -110,7 +110,7 @@ def test_plan_tracked_in_bullet_succeeds_at_nearly_the_planned_cost(task, make_e
 
 
 def test_the_optimum_of_a_certified_episode_is_the_certified_one(task, params, monkeypatch):
-    known, controller = certified.load(task, params), make_controller("optimum", make_task(task), params)
+    known, controller = certified.load(task, params), ControllerName("optimum").make(make_task(task), params)
     controller.reset(0.0, known.states[2], known.constants[2])
     assert controller.plan.cost == known.costs[2]
     np.testing.assert_array_equal(controller.plan.trajectory.u, known.trajectories[2].u)

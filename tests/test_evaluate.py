@@ -170,7 +170,7 @@ def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
     chosen = controllers.controllers_of(["stabilize", "turn"], ["lqr", path])
     assert chosen == {"paper": {"stabilize": ["lqr"], "turn": ["lqr", path]}}
     assert controllers.controllers_of(["stabilize", "turn"], [path]) == {"paper": {"turn": [path]}}
-    assert set(controllers.policy_digests(chosen)) == {f"turn/{path}"}
+    assert set(runner.open_run(tmp_path / "run", 1, chosen)["policies"]) == {f"turn/{path}"}
     with pytest.raises(ValueError, match="which is none of stabilize"):
         controllers.controllers_of(["stabilize"], [path])
 

@@ -9,7 +9,7 @@ from ballbot_gym import BallbotEnv, certified, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import ControllerName
 
 ROBOT = named_robot("paper")
 
@@ -28,7 +28,9 @@ def test_an_episode_costs_what_the_env_said_of_it(name, make_env):
     """A failure's price included."""
     env = make_env("stabilize", physics="rk4")
     controller = (
-        FunctionController(lambda t, x: np.zeros(2)) if name == "nothing" else make_controller(name, env.task, ROBOT)
+        FunctionController(lambda t, x: np.zeros(2))
+        if name == "nothing"
+        else ControllerName(name).make(env.task, ROBOT)
     )
     run = rollout(env, controller, options=certified.load(env.task, ROBOT).options(0))
     found = regret(run.trajectory, env.task)
@@ -40,7 +42,9 @@ def test_an_episode_costs_what_the_env_said_of_it(name, make_env):
 def test_another_sampling_of_the_same_motion_has_the_same_regret():
     """Recorded every 5 ms from 3 s on, as arrays, and for longer than the episode."""
     env = BallbotEnv(Stabilize(duration=8.5), physics="rk4", physics_dt=0.005)
-    run = rollout(env, make_controller("lqr", env.task, ROBOT), options=certified.load("stabilize", ROBOT).options(2))
+    run = rollout(
+        env, ControllerName("lqr").make(env.task, ROBOT), options=certified.load("stabilize", ROBOT).options(2)
+    )
     motion = run.trajectory
     fine, force = [motion.x[0]], np.repeat(motion.u, 4, axis=0)
     for u in force:

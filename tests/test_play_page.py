@@ -98,7 +98,7 @@ def test_what_takes_long_is_said_before_it_is_done(opened, visitor, monkeypatch)
         wait_for(lambda: "preparing NMPC" in visitor.value("text"))
         raise ValueError("no way")
 
-    monkeypatch.setattr("ballbot_train.report.simulation.make_controller", made)
+    monkeypatch.setattr("ballbot_train.report.simulation.ControllerName.make", made)
     visitor.ask("Controller", "nmpc")
     wait_for(lambda: "no way" in visitor.value("text") and visitor.value("Controller") == "lqr")
 

@@ -20,7 +20,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import Randomization
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.files import BEST, SHIPPED, PolicyError, PolicySpec, shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
 from ballbot_train.policy.printed import javascript_function
@@ -87,8 +87,8 @@ def test_every_scenario_runs_as_in_python_over_an_episode(engine, tmp_path):
     for scenario, (by_policy, by_lqr) in zip(SCENARIOS, found, strict=True):
         env = BallbotEnv(scenario.task, physics="rk4")
         path = shipped_policies(env.task)[BEST[scenario.task]]
-        single, double = make_controller(str(path), env.task, env.params), in_double(path, env.task, env.params)
-        lqr = make_controller("lqr", env.task, env.params)
+        single, double = ControllerName(str(path)).make(env.task, env.params), in_double(path, env.task, env.params)
+        lqr = ControllerName("lqr").make(env.task, env.params)
         for run, controller, close in ((by_policy, double, CLOSE), (by_policy, single, FLOAT32), (by_lqr, lqr, CLOSE)):
             episode = rollout(env, controller, options=start_of(scenario, env.task))
             np.testing.assert_allclose(run["xs"], episode.trajectory.x, atol=close, err_msg=scenario.title)

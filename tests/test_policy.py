@@ -14,7 +14,7 @@ from ballbot_gym.robot import ROBOTS, default_params, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector.batch import BallbotBatch
-from ballbot_train.evaluation.controllers import make_controller, names
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.policy.files import BEST, PolicyError, PolicyFile, PolicySpec, shipped_policies
 from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
@@ -78,10 +78,10 @@ def test_a_policy_is_loaded_for_the_robot_that_its_file_names(tmp_path):
 @pytest.mark.parametrize("name", TASKS)
 def test_every_named_controller_can_be_made(name):
     task = TASKS[name]()
-    for controller in names(task):
-        assert hasattr(make_controller(controller, task, default_params()), "act")
+    for controller in ControllerName.known(task):
+        assert hasattr(ControllerName(controller).make(task, default_params()), "act")
     with pytest.raises(ValueError, match="unknown controller 'lqrr'"):
-        make_controller("lqrr", task, default_params())
+        ControllerName("lqrr").make(task, default_params())
 
 
 SHIPPED = [

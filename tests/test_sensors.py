@@ -10,7 +10,7 @@ from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import TRACKS, Sensors, named_robot
 from ballbot_gym.rollout import rollout
-from ballbot_train.evaluation.controllers import controllers_of, make_controller
+from ballbot_train.evaluation.controllers import ControllerName, controllers_of
 from ballbot_train.evaluation.evaluate import evaluate
 
 DT = 0.02
@@ -124,7 +124,7 @@ def test_batches_measure_what_single_envs_do(monkeypatch):
 
 def test_lqr_behind_the_filter_comes_to_rest_from_sensors_alone():
     env = BallbotEnv(robot="omni", physics="rk4", observation="sensors")
-    controller, known = make_controller("lqr-ekf", env.task, env.params), certified.load(env.task, "omni")
+    controller, known = ControllerName("lqr-ekf").make(env.task, env.params), certified.load(env.task, "omni")
     for i in range(3):
         episode = rollout(env, controller, seed=i, options=known.options(i))
         assert episode.success
@@ -133,7 +133,7 @@ def test_lqr_behind_the_filter_comes_to_rest_from_sensors_alone():
         assert off[2:4].max() < 3e-3  # rad; 1e-3 is usual
         assert off[:2].max() < 0.02  # m
     with pytest.raises(ValueError, match="needs states"):
-        rollout(env, make_controller("lqr", env.task, env.params))
+        rollout(env, ControllerName("lqr").make(env.task, env.params))
 
 
 def test_evaluation_shows_sensors_to_a_filtered_controller():

@@ -23,7 +23,7 @@ from ballbot_gym.vector.episodes import run_episodes
 from ballbot_train import evaluate, load_policy
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation import fresh
-from ballbot_train.evaluation.controllers import controllers_of, make_controller
+from ballbot_train.evaluation.controllers import ControllerName, controllers_of
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started
@@ -126,7 +126,7 @@ def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, tr
 def test_a_batch_of_filters_does_what_one_does():
     result = evaluate_fresh("shac-adaptive", "turn", 3, randomization="late")
     env = BallbotEnv("turn", physics="rk4", randomization="late")
-    controller = make_controller("shac-adaptive", env.task, env.params)
+    controller = ControllerName("shac-adaptive").make(env.task, env.params)
     for i in range(3):
         given = {"state": result.states[i], "constants": result.constants[i], "drawn": result.drawn[i]}
         assert rollout(env, controller, options=given).cost == pytest.approx(result.costs[i], rel=1e-4)

@@ -12,7 +12,7 @@ from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Randomization, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.options import Filter, WorkersOption
-from ballbot_train.evaluation.controllers import behind, controllers_of, make_controller, policy_digests, task_name
+from ballbot_train.evaluation.controllers import ControllerName, controllers_of
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.evaluation.results import TABLE, leaderboard
 from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
@@ -73,7 +73,7 @@ def evaluate(
     """
     varied = Randomization.checked(randomization)
     robot = robot if task is None else own_robot(task, robot)
-    task, policy = task_name(policy, task, robot), behind(policy, filter)
+    task, policy = ControllerName(policy).task(task, robot), ControllerName(policy).behind(filter).text
     chosen = controllers_of([task], [policy], [robot])
     check_least(0, optima=optima or 0)
     named = f"{task}-{file_part(policy)}" + (f"+{randomization}" if randomization else "")
@@ -129,9 +129,10 @@ def _evaluate_fresh(
         about = files.read_json(out / "fresh.json").get("about")
         held = {name: about.get(name, of[name]) for name in of} if isinstance(about, dict) else {}
         jobs.check_same(held, of, out, "results")
+    file = ControllerName(policy).file(make_task(task, robot), robot)
     facts = provenance() | {
         **of,
-        "policies": policy_digests({robot: {task: [policy]}}, robot),
+        "policies": {} if file is None else {f"{task}/{policy}": file.weights_digest()},
         "seed": seed,
         "episodes": count,
         "physics": "closed form, batched, float64",
@@ -207,7 +208,7 @@ def _motions(
         The commands that show them.
     """
     env = BallbotEnv(task, physics="rk4", robot=robot, randomization=varied)
-    controller = make_controller(policy, env.task, env.params)
+    controller = ControllerName(policy).make(env.task, env.params)
     for stale in folder.glob(f"{kind}-*.npz"):  # of an earlier run of the command
         stale.unlink()
     commands = []

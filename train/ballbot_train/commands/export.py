@@ -5,7 +5,7 @@ from typing import Literal
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, file_name, named_robot
-from ballbot_train.evaluation.controllers import behind, policy_path, split, task_name
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.work.console import RobotName, console
 
@@ -35,13 +35,13 @@ def export(
         prefix: beginning of all names in a C file; if one program contains several controllers, give each its own.
         filter: ekf, for a robot with wheels and C only: the file then computes the state from the robot's sensor readings.
     """
-    policy = behind(policy, filter)
-    filtered = split(policy)[1] == "ekf" and format == "c" and bool(named_robot(robot).SENSORS)
-    name, policy = file_part(policy), split(policy)[0] if filtered else policy
-    task = task_name(policy, task, robot)
+    name = ControllerName(policy).behind(filter)
+    filtered = name.filter == "ekf" and format == "c" and bool(named_robot(robot).SENSORS)
+    exported = ControllerName(name.alone) if filtered else name
+    task = exported.task(task, robot)
     problem = make_task(task, robot)
-    source = policy if (policy, format) == ("lqr", "c") else policy_path(policy, problem, robot)
-    path = Path("runs") / "export" / f"{file_name(task, robot)}-{name}.{format}" if out is None else out
+    source = "lqr" if (exported.text, format) == ("lqr", "c") else exported.path(problem, robot)
+    path = Path("runs") / "export" / f"{file_name(task, robot)}-{file_part(name.text)}.{format}" if out is None else out
     if format == "c":
         from ballbot_train.policy.export_c import export_c  # it imports torch
 

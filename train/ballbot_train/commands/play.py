@@ -7,7 +7,7 @@ from ballbot_gym.drawing.viewer import PORT, Viewer
 from ballbot_gym.env import make_task
 from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Ballbot, named_robot
-from ballbot_train.evaluation.controllers import task_name
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.report.live_page import PlayPage
 from ballbot_train.report.simulation import Playground, Start
 from ballbot_train.work.console import RobotName, console
@@ -40,7 +40,7 @@ def play(
         port: port of the page, which only this machine can open; if it is taken, the next free one.
         randomization: name of a track, such as "unknown": it draws a robot for every episode, hidden from the controllers.
     """
-    task = task_name(controller or "", task, robot)
+    task = ControllerName(controller or "").task(task, robot)
     robot = own_robot(task, robot)
     if not isinstance(params := named_robot(robot), Ballbot):
         raise ValueError(

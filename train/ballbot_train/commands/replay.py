@@ -10,7 +10,7 @@ from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter
-from ballbot_train.evaluation.controllers import behind
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import Format, film_frames, write_film, write_strip
 from ballbot_train.report.replay import certified_replay, file_replay
@@ -73,7 +73,7 @@ def replay(
         robot = own_robot(source[0], robot)
         physics = physics_or_default(physics, robot)
         _check(bool(controllers), "give at least one controller")
-        controllers = tuple(behind(name, filter) for name in controllers)
+        controllers = tuple(ControllerName(name).behind(filter).text for name in controllers)
         shown = certified_replay(source[0], controllers, episode, physics, robot=robot, frictions=frictions)
         made = file_name(source[0], robot)
         # parts of names hold no plus, so that no other controllers or floors make the same name

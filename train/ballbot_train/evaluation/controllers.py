@@ -6,7 +6,8 @@ import inspect
 import itertools
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -31,174 +32,203 @@ def _experts() -> ModuleType:
     return ballbot_baselines
 
 
-def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
-    """The controllers that a task has for a robot, experts first; for `track` see `shipped_policies`."""
-    return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
-
-
 def _filters(params: Robot) -> tuple[str, ...]:
     """The filters that may stand in front of controllers of a robot."""
     return tuple(ending[1:] for ending in _experts().FILTERS) if params.TRACK_FILTERS else (_SENSORS,)
 
 
-def split(name: str) -> tuple[str, str]:
-    """A controller's name without its filter, and the filter or "": "shac-adaptive-ekf" is ("shac", "adaptive-ekf")."""
-    ending = next((ending for ending in _experts().FILTERS if name.endswith(ending)), "")
-    return name.removesuffix(ending), ending[1:]
+@dataclass(frozen=True)
+class ControllerName:
+    """What users write for a controller, and what it means: "shac-adaptive-ekf" is "shac" behind the filter "adaptive-ekf".
 
-
-def behind(name: str, filter: str | None) -> str:
-    """The name of a controller with a filter in front of it, as `split` takes it apart.
-
-    Raises:
-        ValueError: there is one in front of it already.
+    Without its filter it is the name of an expert, in `CONTROLLERS` or `VARIANTS`, the name of a policy that comes with the
+    package ("shac"), or the path of a policy file, of a training run's folder, or of a model that Stable-Baselines3 saved.
     """
-    if filter and split(name)[1]:
-        raise ValueError(f"{name} has a filter in front of it already; leave out --filter, or write {split(name)[0]}")
-    return f"{name}-{filter}" if filter else name
 
+    text: str
 
-def _of_other_robot(name: str, task: Task) -> str:
-    """What to type for a policy of a task that comes with the package for other robots; "" of another name."""
-    robots = [robot for robot in ROBOTS if name in shipped_policies(task, robot, None)]
-    if not robots:
-        return ""
-    plural = "s" if len(robots) > 1 else ""
-    return (
-        f"it was made for the robot{plural} {', '.join(robots)}: `ballbot transfer --made-for {robots[0]} "
-        f"--controllers {name} --robot YOURS` runs it on yours"
-    )
+    @staticmethod
+    def known(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
+        """The controllers that a task has for a robot, experts first; for `track` see `shipped_policies`."""
+        return [*_experts().CONTROLLERS, *shipped_policies(task, robot, track)]
 
+    @property
+    def _ending(self) -> str:
+        return next((ending for ending in _experts().FILTERS if self.text.endswith(ending)), "")
 
-def is_expert(name: str) -> bool:
-    """Whether a name is an expert's or a variant's, and no policy's."""
-    return split(name)[0] in _experts().CONTROLLERS | _experts().VARIANTS
+    @property
+    def alone(self) -> str:
+        """The name without its filter."""
+        return self.text.removesuffix(self._ending)
 
+    @property
+    def filter(self) -> str:
+        """The filter, or ""."""
+        return self._ending[1:]
 
-def is_file(name: str) -> bool:
-    """Whether a controller's name is the path of a policy file, of a run's folder with one, or of a saved model."""
-    alone, _ = split(name)
-    path = Path(alone)
-    return not is_expert(name) and (bool(path.suffix) or (path.name != alone and PolicyFile(path).is_run))
+    def behind(self, filter: str | None) -> "ControllerName":
+        """The same controller with a filter in front of it.
 
+        Raises:
+            ValueError: there is one in front of it already.
+        """
+        if filter and self.filter:
+            raise ValueError(
+                f"{self.text} has a filter in front of it already; leave out --filter, or write {self.alone}"
+            )
+        return ControllerName(f"{self.text}-{filter}") if filter else self
 
-def _is_saved_model(name: str) -> bool:
-    """Whether a controller's name is the path of a model that Stable-Baselines3 saved."""
-    return Path(split(name)[0]).suffix == ".zip"
+    @property
+    def is_expert(self) -> bool:
+        """Whether it is an expert or a variant, and no policy."""
+        return self.alone in _experts().CONTROLLERS | _experts().VARIANTS
 
+    @property
+    def is_file(self) -> bool:
+        """Whether it is the path of a policy file, of a run's folder with one, or of a saved model."""
+        path = Path(self.alone)
+        return not self.is_expert and (bool(path.suffix) or (path.name != self.alone and PolicyFile(path).is_run))
 
-def _acts_in(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether a task has a controller of that name for a robot. For files see `_is_made_for`."""
-    if is_file(name):
-        return _is_made_for(name, task, robot)
-    alone, filter = split(name)
-    fits = not filter or filter in _filters(named_robot(robot))
-    return name in _experts().VARIANTS or (fits and alone in names(task, robot, None))
+    @property
+    def _is_saved_model(self) -> bool:
+        """Whether it is the path of a model that Stable-Baselines3 saved."""
+        return Path(self.alone).suffix == ".zip"
 
+    def acts_in(self, task: Task, robot: str = PAPER) -> bool:
+        """Whether a task has such a controller for a robot.
 
-def _is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether the policy of a file is one for a task and a robot. A saved model is judged by its spaces alone.
+        Raises:
+            PolicyError: see `_is_made_for`.
+        """
+        if self.is_file:
+            return self._is_made_for(task, robot)
+        fits = not self.filter or self.filter in _filters(named_robot(robot))
+        return self.text in _experts().VARIANTS or (fits and self.alone in self.known(task, robot, None))
 
-    Raises:
-        PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
-    """
-    if _is_saved_model(name):
-        from ballbot_train.policy.saved_models import fits  # it imports torch
+    def _is_made_for(self, task: Task, robot: str = PAPER) -> bool:
+        """Whether the policy of a file is one for a task and a robot. A saved model is judged by its spaces alone.
 
-        return fits(split(name)[0], task, named_robot(robot))
-    spec = PolicyFile(split(name)[0]).read()["spec"]
-    return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
+        Raises:
+            PolicyError: the file is missing or damaged, or a saved model has observations of the task's size in other spaces.
+        """
+        if self._is_saved_model:
+            from ballbot_train.policy.saved_models import fits  # it imports torch
 
+            return fits(self.alone, task, named_robot(robot))
+        spec = PolicyFile(self.alone).read()["spec"]
+        return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
-def _made_for(name: str) -> str:
-    """What the policy of a file was made for, in words.
+    @property
+    def made_for(self) -> str:
+        """What the policy of a file was made for, in words.
 
-    Raises:
-        PolicyError: the file is missing or damaged.
-    """
-    if _is_saved_model(name):
-        from ballbot_train.policy.saved_models import read
+        Raises:
+            PolicyError: the file is missing or damaged.
+        """
+        if self._is_saved_model:
+            from ballbot_train.policy.saved_models import read
 
-        return f"a task with {read(split(name)[0]).observations} observations"
-    spec = PolicyFile(split(name)[0]).read()["spec"]
-    robot = spec.get("robot", PAPER)
-    return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
+            return f"a task with {read(self.alone).observations} observations"
+        spec = PolicyFile(self.alone).read()["spec"]
+        robot = spec.get("robot", PAPER)
+        return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
+    def task(self, given: str | None, robot: str = PAPER) -> str:
+        """The name of the task that is given, or else the registered one that a policy file was made for, or stabilize.
 
-def _file_of(name: str, task: Task, robot: str = PAPER) -> str | Path:
-    """The file of a policy that comes with the package, or that is named by its path, perhaps with a filter."""
-    alone, _ = split(name)
-    return shipped_policies(task, robot, None).get(alone, alone)
+        Raises:
+            ValueError: no such task.
+            PolicyError: a policy file that is missing or damaged.
+        """
+        if given is not None:
+            check_names("task", [given], TASKS)
+            return given
+        if not self.is_file:
+            return "stabilize"
+        named = next((name for name in TASKS if self._is_made_for(make_task(name, robot), robot)), None)
+        if named is None:
+            raise ValueError(
+                f"{self.text} was made for {self.made_for}, which is none of {', '.join(TASKS)} with its default fields for "
+                f"the robot {robot}; give --task, or another --robot"
+            )
+        return named
 
-
-def policy_digest(name: str, task: Task, robot: str | Robot = PAPER) -> str:
-    """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
-    if is_expert(name):
-        return ""
-    return PolicyFile(_file_of(name, task, robot if isinstance(robot, str) else robot_name(robot))).weights_digest()
-
-
-def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
-    """The task that is named, or the registered one that a policy file names, or stabilize.
-
-    Raises:
-        ValueError: no such task.
-        PolicyError: a policy file that is missing or damaged.
-    """
-    if task is not None:
-        check_names("task", [task], TASKS)
-        return task
-    if not is_file(policy):
-        return "stabilize"
-    named = next((name for name in TASKS if _is_made_for(policy, make_task(name, robot), robot)), None)
-    if named is None:
-        raise ValueError(
-            f"{policy} was made for {_made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields for the "
-            f"robot {robot}; give --task, or another --robot"
+    def hint(self, task: Task) -> str:
+        """What to type for a policy of a task that comes with the package for other robots; "" of another name."""
+        robots = [robot for robot in ROBOTS if self.text in shipped_policies(task, robot, None)]
+        if not robots:
+            return ""
+        plural = "s" if len(robots) > 1 else ""
+        return (
+            f"it was made for the robot{plural} {', '.join(robots)}: `ballbot transfer --made-for {robots[0]} "
+            f"--controllers {self.text} --robot YOURS` runs it on yours"
         )
-    return named
 
+    def file(self, task: Task, robot: str | Robot = PAPER) -> PolicyFile | None:
+        """The policy of a task that comes with the package, or that is named by its path; None of an expert."""
+        if self.is_expert:
+            return None
+        shipped = shipped_policies(task, robot if isinstance(robot, str) else robot_name(robot), None)
+        return PolicyFile(shipped.get(self.alone, self.alone))
 
-def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
-    """The file of a policy that comes with the package, or that is named by its path.
+    def path(self, task: Task, robot: str = PAPER) -> Path:
+        """The file of a policy without a filter.
 
-    Raises:
-        ValueError: it is an expert, or nothing of that name.
-    """
-    shipped = shipped_policies(task, robot, None)
-    if name in shipped:
-        return shipped[name]
-    if name in _experts().CONTROLLERS:
-        raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
-    if not is_file(name):
-        raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
-    if _is_saved_model(name):
-        raise ValueError(
-            f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
-        )
-    return Path(name)
+        Raises:
+            ValueError: it is an expert, a saved model of another library, or nothing of that name.
+        """
+        shipped = shipped_policies(task, robot, None)
+        if self.text in shipped:
+            return shipped[self.text]
+        if self.text in _experts().CONTROLLERS:
+            raise ValueError(
+                f"{self.text} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}"
+            )
+        if not self.is_file:
+            raise ValueError(
+                f"unknown policy {self.text!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json"
+            )
+        if self._is_saved_model:
+            raise ValueError(
+                f"{self.text} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
+            )
+        return Path(self.text)
 
+    def make(self, task: Task, params: Robot) -> Controller:
+        """The controller. torch is imported only for a policy.
 
-def make_controller(name: str, task: Task, params: Robot) -> Controller:
-    """The controller of a name. torch is imported only for a policy.
+        Args:
+            task: what it is to do.
+            params: the robot that it is made for.
 
-    Args:
-        name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
-            or of a model that Stable-Baselines3 saved; see `saved_models`. A filter may follow, see `split`.
-        task: what it is to do.
-        params: the robot that it is made for.
+        Raises:
+            ValueError: nothing of that name.
+            PolicyError: a policy file that is damaged or of another task.
+        """
+        if self.text in _experts().VARIANTS and params.TRACK_FILTERS:
+            return _experts().VARIANTS[self.text](task, params)
+        controller, filter = ControllerName(self.alone)._unfiltered(task, params), self.filter
+        if getattr(controller, "estimates", None) is not None:  # it needs an estimate of the robot
+            filter = filter or "adaptive"
+        return _filtered(controller, filter, task, params)
 
-    Raises:
-        ValueError: nothing of that name.
-        PolicyError: a policy file that is damaged or of another task.
-    """
-    if name in _experts().VARIANTS and params.TRACK_FILTERS:
-        return _experts().VARIANTS[name](task, params)
-    alone, filter = split(name)
-    controller = _unfiltered(alone, task, params)
-    if getattr(controller, "estimates", None) is not None:  # it needs an estimate of the robot
-        filter = filter or "adaptive"
-    return _filtered(controller, filter, task, params)
+    def _unfiltered(self, task: Task, params: Robot) -> Controller:
+        experts = _experts().CONTROLLERS | _experts().VARIANTS
+        if self.text in experts:
+            return experts[self.text](task, params)
+        robot = robot_name(params)
+        shipped = shipped_policies(task, robot, None)
+        if self.text not in shipped and not self.is_file:
+            known = f"{task.id} has {', '.join(self.known(task, robot))}, or give a policy's .json"
+            raise ValueError(f"unknown controller {self.text!r}; {self.hint(task) or known}")
+        if self._is_saved_model:
+            from ballbot_train.policy.network import PolicyController  # it imports torch
+            from ballbot_train.policy.saved_models import load_actor
+
+            return PolicyController(task, params, load_actor(self.text, task, params))
+        from ballbot_train.policy.network import load_policy
+
+        return load_policy(shipped.get(self.text, self.text), task, params)
 
 
 def _filtered(controller: Controller, filter: str | None, task: Task, params: Robot) -> Controller:
@@ -213,24 +243,6 @@ def _filtered(controller: Controller, filter: str | None, task: Task, params: Ro
     return FilteredController(task, params, f"-{filter}", controller)
 
 
-def _unfiltered(name: str, task: Task, params: Robot) -> Controller:
-    if name in _experts().CONTROLLERS | _experts().VARIANTS:
-        return (_experts().CONTROLLERS | _experts().VARIANTS)[name](task, params)
-    robot = robot_name(params)
-    shipped = shipped_policies(task, robot, None)
-    if name not in shipped and not is_file(name):
-        known = f"{task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
-        raise ValueError(f"unknown controller {name!r}; {_of_other_robot(name, task) or known}")
-    if _is_saved_model(name):
-        from ballbot_train.policy.network import PolicyController  # it imports torch
-        from ballbot_train.policy.saved_models import load_actor
-
-        return PolicyController(task, params, load_actor(name, task, params))
-    from ballbot_train.policy.network import load_policy
-
-    return load_policy(shipped.get(name, name), task, params)
-
-
 def as_controller(policy: Any, task: Task, params: Robot, filter: str | None = None) -> Controller:
     """Any policy or controller as a Controller.
 
@@ -238,17 +250,17 @@ def as_controller(policy: Any, task: Task, params: Robot, filter: str | None = N
         policy: a Controller; a Stable-Baselines3 model that was trained in the env's own spaces, whose VecNormalize is
             applied where it was trained with one; another object with `predict(observation)`, which returns an action or a
             tuple that begins with one; a torch module from observations (B, no) to actions (B, 2); a function from
-            observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
+            observation (no,) float32 to action (2,) in [−1, 1]; or a name or file, see `ControllerName`.
         task: what it is to do.
         params: the robot that it is made for.
         filter: name of a filter in front of it.
 
     Raises:
         TypeError: it is none of these.
-        ValueError, PolicyError: as `make_controller`; or the model was trained in other spaces than the env's.
+        ValueError, PolicyError: as `ControllerName.make`; or the model was trained in other spaces than the env's.
     """
     if isinstance(policy, str | Path):
-        return make_controller(behind(str(policy), filter), task, params)
+        return ControllerName(str(policy)).behind(filter).make(task, params)
     return _filtered(_acting(policy, task, params), filter, task, params)
 
 
@@ -346,7 +358,7 @@ def controllers_of(
         tasks: names of tasks.
         given: names of controllers; default, all that tasks and robots have, but for variants.
         robots: by name.
-        filter: in front of each of those given, see `behind`.
+        filter: in front of each of those given.
         tracks: whether policies that were trained on tracks are among the default.
 
     Raises:
@@ -357,49 +369,27 @@ def controllers_of(
     check_names("task", tasks, TASKS, least=1)
     if filter and not given:
         raise ValueError("--filter needs to know which controllers get the filter; give --controllers too")
-    given = [behind(name, filter) for name in given]
+    given = [ControllerName(name).behind(filter).text for name in given]
     track = None if tracks or given else ""
-    known = {robot: {task: names(make_task(task, robot), robot, track) for task in tasks} for robot in robots}
+    known = {
+        robot: {task: ControllerName.known(make_task(task, robot), robot, track) for task in tasks} for robot in robots
+    }
     if not given:
         return known
     if repeated := [name for name, count in Counter(given).items() if count > 1]:
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
     chosen: dict[str, dict[str, list[str]]] = {}
     for robot, task in itertools.product(robots, tasks):
-        if found := [name for name in given if _acts_in(name, make_task(task, robot), robot)]:
+        if found := [name for name in given if ControllerName(name).acts_in(make_task(task, robot), robot)]:
             chosen.setdefault(robot, {})[task] = found
     used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
     unused = [name for name in given if name not in used]
-    if unused and is_file(unused[0]):
-        raise ValueError(f"{unused[0]} was made for {_made_for(unused[0])}, which is none of {', '.join(tasks)}")
-    for task in tasks if unused else ():
-        if hint := _of_other_robot(unused[0], make_task(task, robots[0])):
-            raise ValueError(f"unknown controller {unused[0]} for the robot {robots[0]}; {hint}")
+    if unused:
+        name = ControllerName(unused[0])
+        if name.is_file:
+            raise ValueError(f"{name.text} was made for {name.made_for}, which is none of {', '.join(tasks)}")
+        for task in tasks:
+            if hint := name.hint(make_task(task, robots[0])):
+                raise ValueError(f"unknown controller {name.text} for the robot {robots[0]}; {hint}")
     check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
     return chosen
-
-
-def policy_digests(
-    controllers: Mapping[str, Mapping[str, Sequence[str]]],
-    robot: str = PAPER,
-    of: Callable[[PolicyFile], str] = PolicyFile.weights_digest,
-) -> dict[str, str]:
-    """A digest of every learned policy among controllers by robot and task.
-
-    Args:
-        controllers: as `controllers_of` gives them.
-        robot: on which they run, by name.
-        of: which digest.
-
-    Returns:
-        The digests under "TASK/NAME", or "ROBOT/TASK/NAME" of policies that were made for another robot.
-    """
-    return {
-        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(
-            PolicyFile(_file_of(name, make_task(task, made_for), made_for))
-        )
-        for made_for, by_task in controllers.items()
-        for task, group in by_task.items()
-        for name in group
-        if not is_expert(name)
-    }

@@ -17,7 +17,7 @@ from ballbot_gym.robot import PAPER, Randomization, Robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_train.evaluation import counterparts, optima, recordings
-from ballbot_train.evaluation.controllers import as_controller, behind, is_file, policy_digest
+from ballbot_train.evaluation.controllers import ControllerName, as_controller
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, write_results
 from ballbot_train.evaluation.runner import checked_episodes, run_episodes
 from ballbot_train.work.console import progress_bars
@@ -120,17 +120,18 @@ def evaluate(
                 env.task, env.physics, params=env.params, randomization=env.randomization, observation="sensors"
             )
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
-        file = str(Path(policy).absolute()) if isinstance(policy, str | Path) and is_file(str(policy)) else ""
+        written = ControllerName(str(policy)) if isinstance(policy, str | Path) else None
+        file = str(Path(policy).absolute()) if written is not None and written.is_file else ""
         held = None if out is None else _Held.of(Path(out))
         on = name_of(env.task) or type(env.task).__name__.lower()
-        named = name or behind(_name(policy, file, on, held), filter), on
+        named = name or ControllerName(_name(policy, file, on, held)).behind(filter).text, on
         motions: list[recordings.Recording] = []
         with progress_bars({"episodes": len(indices)}, late=True) as advance:
             results = run_episodes(env, controller, *named, indices, 0, known, motions, partial(advance, "episodes"))
         (row,) = leaderboard(results)
         if held is not None:
-            digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
-            held.add(env, file, digest, results, motions)
+            learned = None if written is None else written.file(env.task, env.params)
+            held.add(env, file, "" if learned is None else learned.weights_digest(), results, motions)
         return row
     finally:
         env.close()
@@ -149,7 +150,7 @@ def _on_fresh(
 
     if filter and not isinstance(policy, str | Path):
         raise ValueError("on fresh episodes a filter needs a policy by name or file; give one, or leave out filter")
-    policy = behind(str(policy), filter) if filter else policy
+    policy = ControllerName(str(policy)).behind(filter).text if filter else policy
     robot = robot if isinstance(robot, str) else robot_name(robot)
     return evaluate_fresh(policy, task, count, name=name, robot=robot, randomization=randomization)
 

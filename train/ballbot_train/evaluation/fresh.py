@@ -32,7 +32,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
-from ballbot_train.evaluation.controllers import as_controller, is_expert, make_controller
+from ballbot_train.evaluation.controllers import ControllerName, as_controller
 from ballbot_train.evaluation.results import near_share, to_json, warn_of_small
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.policy.layers import with_compiled_layers
@@ -328,7 +328,8 @@ def _acting(policy: Any, task: Task, robot: str) -> Any:
     """What acts in many episodes at once: a Controller, or a function of tensors."""
     params = named_robot(robot)
     if isinstance(policy, str | Path):
-        controller = None if is_expert(str(policy)) else make_controller(str(policy), task, params)
+        name = ControllerName(str(policy))
+        controller = None if name.is_expert else name.make(task, params)
         if controller is None or getattr(controller, "senses", False):
             what = "an expert" if controller is None else "behind the filter of sensors"
             raise ValueError(

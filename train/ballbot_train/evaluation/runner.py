@@ -23,8 +23,8 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, Randomization, Robot, named_robot, robot_setting
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
+from ballbot_train.evaluation.controllers import ControllerName, as_controller
 from ballbot_train.evaluation.results import Result, Row, table_cells, write_results
 from ballbot_train.policy.files import PolicyFile, shipped_ways
 from ballbot_train.work import jobs
@@ -63,7 +63,7 @@ def open_run(
     """
     check_least(0, seed=settings.get("seed", 0))
     digests = PolicyFile.weights_digest, PolicyFile.network_digest
-    policies, networks = (registry.policy_digests(chosen, robot, of) for of in digests)
+    policies, networks = (_digests(chosen, robot, of) for of in digests)
     problems = {
         task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
         for made_for, by_task in chosen.items()
@@ -83,6 +83,19 @@ def open_run(
     facts |= {"trained_by": ways} if ways else {}
     jobs.RunFolder(out).claim({key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
     return facts
+
+
+def _digests(
+    chosen: Mapping[str, Mapping[str, Sequence[str]]], robot: str, of: Callable[[PolicyFile], str]
+) -> dict[str, str]:
+    """A digest of every learned policy under "TASK/NAME", or "ROBOT/TASK/NAME" of policies made for another robot."""
+    return {
+        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(file)
+        for made_for, by_task in chosen.items()
+        for task, group in by_task.items()
+        for name in group
+        if (file := ControllerName(name).file(make_task(task, made_for), made_for)) is not None
+    }
 
 
 def publish(
@@ -202,7 +215,8 @@ def run_groups(
         if record:
             motions = [recordings.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
-            who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
+            policy = ControllerName(group.controller).file(task, group.robot)
+            who = group.physics, group.controller, "" if policy is None else policy.weights_digest()
             recordings.write_in(out, motions, task, group.task, params, *who)
         results += [Result(**{**entry, "labels": group.labels}) for entry in entries]
     return results
@@ -222,8 +236,8 @@ def _jobs_of(
     """The jobs of a group, of `CHUNK` episodes each."""
     chosen = known[group.problem] if group.starts is None else _without_optima(group.starts)
     # workers need not have a policy's file, so what it holds goes along
-    is_file = registry.is_file(group.controller)
-    sent = registry.make_controller(group.controller, *group.believed) if is_file else group.controller
+    name = ControllerName(group.controller)
+    sent = name.make(*group.believed) if name.is_file else group.controller
     words = "-".join(map(str, (group.task, group.controller, group.physics, *group.labels.values())))
     count = episodes if group.starts is None else len(group.starts)
     group = replace(group, starts=None)  # they are in the set
@@ -246,7 +260,7 @@ def _episode_entries(
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     robot, varied = floor(group.robot, group.friction), group.randomization
-    made = registry.as_controller(sent, *group.believed)
+    made = as_controller(sent, *group.believed)
     world: dict[str, Any] = {"randomization": varied, "robot": robot, **group.fields}
     if getattr(made, "senses", False):
         world["observation"] = "sensors"

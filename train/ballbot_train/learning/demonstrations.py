@@ -46,7 +46,7 @@ from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Robot, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation import controllers
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.learning.datasets import IN_DATASET, metadata_of
 from ballbot_train.policy.files import OBSERVATION_VERSION, PolicyFile, shipped_policies
 from ballbot_train.work import jobs, shards
@@ -84,7 +84,7 @@ class DemoConfig:
         object.__setattr__(self, "robot", own_robot(self.task, self.robot))
         object.__setattr__(self, "physics", checked_physics(self.physics, named_robot(self.robot)))
         task = make_task(self.task, self.robot)
-        check_names("expert", [self.expert], controllers.names(task, self.robot))
+        check_names("expert", [self.expert], ControllerName.known(task, self.robot))
         if not 1 <= self.episodes <= _MOST_EPISODES:
             raise ValueError(f"episodes must be 1 to {_MOST_EPISODES}, not {self.episodes}")
         if not 0 <= self.seed < 2**32:
@@ -106,7 +106,7 @@ class Expert:
 
     def __init__(self, name: str, task: Task, params: Robot, backoff: Backoff = EXECUTED):
         """Args: name: as in `DemoConfig`; backoff: given to a controller whose constructor takes one."""
-        controller: Any = controllers.make_controller(name, task, params)
+        controller: Any = ControllerName(name).make(task, params)
         if "backoff" in inspect.signature(type(controller)).parameters:
             controller = cast(Any, CONTROLLERS[name])(task, params, backoff=backoff)
         self._task, self._params, self._controller = task, params, controller
@@ -201,7 +201,7 @@ class Expert:
 def _content(config: DemoConfig) -> dict[str, Any]:
     """What decides a dataset behind the names that its settings give."""
     content = {"problem": certified.named_problem(config.task, config.robot)}
-    if controllers.is_expert(config.expert):
+    if ControllerName(config.expert).is_expert:
         return content
     shipped = shipped_policies(make_task(config.task, config.robot), config.robot)
     return content | {"expert_policy": PolicyFile(shipped[config.expert]).digest()}

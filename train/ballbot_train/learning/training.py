@@ -51,7 +51,7 @@ from ballbot_gym.robot import PAPER, Randomization, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import digest, problem_parts
 from ballbot_train.evaluation import fresh, runner
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.results import Row, leaderboard, near_share, success_text
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
@@ -331,7 +331,7 @@ class _Run:
         """Measures the best policy on the first certified episodes in PyBullet, and adds the result to its JSON file."""
         network = load_network(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
-        controller = make_controller(str(self.out / "policy.json"), self.task, env.params)
+        controller = ControllerName(str(self.out / "policy.json")).make(self.task, env.params)
         results = runner.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
         (row,) = leaderboard(results)

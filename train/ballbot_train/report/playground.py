@@ -23,7 +23,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import TRACKS, Randomization, Robot, default_params
 from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation.controllers import policy_path, task_name
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.files import BEST, PolicyError, PolicyFile, shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, load_network
 from ballbot_train.policy.printed import javascript_function, layers_of, policy_function
@@ -129,10 +129,11 @@ def _policies(given: Sequence[str]) -> dict[str, Path]:
     """The file of each task's policy."""
     paths: dict[str, Path] = {}
     for policy in given:
-        task = task_name(str(policy), None)
+        name = ControllerName(str(policy))
+        task = name.task(None)
         if task in paths:
             raise ValueError(f"{paths[task]} and {policy} are both policies for {task}; give one")
-        paths[task] = policy_path(str(policy), make_task(task))
+        paths[task] = name.path(make_task(task))
     return {task: paths.get(task, shipped_policies(make_task(task))[learner]) for task, learner in BEST.items()}
 
 

@@ -15,7 +15,7 @@ from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.names import shortened
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.runner import floor
@@ -127,7 +127,7 @@ def certified_replay(
     }
     named = labels.labels(controllers, task, ways)
     for name, friction in itertools.product(controllers, frictions or (None,)):
-        controller, slips = make_controller(name, problem, params), list[float]()
+        controller, slips = ControllerName(name).make(problem, params), list[float]()
         env = BallbotEnv(problem, physics=physics, robot=floor(robot, friction))
         try:
             options = episode_set.options(episode)

@@ -19,7 +19,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, ROBOTS, Randomization, default_params, named_robot, tilt
 from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation.controllers import is_expert, make_controller, names
+from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.policy.files import BEST
 from ballbot_train.report import labels
@@ -53,8 +53,8 @@ class _World:
         check_names("robot", [robot], ROBOTS)
         self.task_name, self.robot, self.params = task, robot, named_robot(robot)
         self.task = make_task(task, robot)
-        known = names(self.task, robot)
-        experts = [name for name in known if is_expert(name)]
+        known = ControllerName.known(self.task, robot)
+        experts = [name for name in known if ControllerName(name).is_expert]
         self.controllers = [*experts, "nmpc-offset-free", *(name for name in known if name not in experts)]
         """What can be chosen, experts first."""
         best = BEST.get(task, "")
@@ -385,7 +385,7 @@ class Playground:
     def _made(self, name: str, world: _World) -> Controller:
         """A controller by name, which is offered from then on."""
         self.announce(f"preparing {labels.label(name)} … the first time in a task, solvers are compiled")
-        controller = make_controller(name, world.task, world.params)
+        controller = ControllerName(name).make(world.task, world.params)
         if name not in world.controllers:  # a file
             world.controllers.append(name)
         return controller
@@ -403,7 +403,8 @@ class Playground:
                 runner.controller.reset(0.0, *map(np.array, start))
             except Exception as error:
                 self.notice = f"{labels.label(runner.name)} cannot start here, LQR does instead: {error}"
-                runner.name, runner.controller = "lqr", make_controller("lqr", self.world.task, self.world.params)
+                runner.name = "lqr"
+                runner.controller = ControllerName("lqr").make(self.world.task, self.world.params)
                 runner.controller.reset(0.0, *map(np.array, start))
 
     def _env(self, world: _World) -> BallbotEnv:
