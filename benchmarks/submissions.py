@@ -79,7 +79,7 @@ class Forger:
 
     def __init__(self, path: Path, target: Path, rng: np.random.Generator):
         self.path, self.target, self.rng = path, target, rng
-        self.honest = recordings.read(path)
+        self.honest = recordings.Recording.read(path)
         rows = self.honest.lengths + 1
         self.first = np.cumsum(rows) - rows
         self.episode = int(rng.integers(EPISODES))

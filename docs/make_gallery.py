@@ -104,7 +104,7 @@ def take_of(row: Entry, episode: int) -> tuple[Replay, Trajectory]:
 
 def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
     """An episode of a submission."""
-    held = recordings.read(path)
+    held = recordings.Recording.read(path)
     steps = held.lengths[:episode].sum()
     states, n = steps + np.count_nonzero(held.lengths[:episode]), held.lengths[episode]
     forces = held.actions[steps : steps + n] * named_robot(row.robot).force_limit

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from ballbot_gym import TASKS, Stabilize, Trajectory, certified
+from ballbot_gym.robot import file_name
 from ballbot_train import evaluate
 from ballbot_train.commands import replay as replays
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.names import file_part, shortened
-from ballbot_train.evaluation.recordings import file_of
 from ballbot_train.evaluation.results import read_results, table_cells
 from ballbot_train.policy.files import shipped_policies
 from ballbot_train.report import figures
@@ -63,7 +63,7 @@ NAMES = (
 
 def test_no_two_names_share_a_file_even_where_case_is_ignored() -> None:
     files = {
-        file_of(task, robot, name).lower()
+        f"{file_name(task, robot)}-{file_part(name)}".lower()
         for task in ("turn", "orbit")
         for robot in ("paper", "rolling")
         for name in NAMES

@@ -319,7 +319,7 @@ def test_a_motion_on_wheels_is_verified_from_its_states_and_actions(tmp_path):
     strong = named_robot("omni_strong")
     evaluate("lqr", "stabilize", 2, "rk4", robot="omni_strong", out=tmp_path)
     (path,) = (tmp_path / "recordings").glob("*.npz")
-    held = recordings.read(path)
+    held = recordings.Recording.read(path)
     mine = dataclasses.replace(held, about=held.about | {"name": "mine", "link": ""})
     assert mine.states.shape[1] == strong.state_size
     row = verify("mine.npz", episodes=2, content=mine.to_bytes())

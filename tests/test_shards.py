@@ -32,7 +32,7 @@ def numbered(log, numbers):
 def made(url, out, episodes, about=None):
     about = {"seed": 1} if about is None else about
     log = str(out.parent / "log")
-    return shards.make(url, about, episodes, partial(numbered, log), out, 1, "numbers", per_shard=7)
+    return shards.Shards.make(url, about, episodes, partial(numbered, log), out, 1, "numbers", per_shard=7)
 
 
 @pytest.mark.parametrize("where", ["folder", "memory"])
@@ -42,7 +42,7 @@ def test_every_episode_is_in_one_shard_in_order(where, tmp_path):
     read = shards.Shards(url)
     assert [arrays["i"].tolist() for arrays in read] == [[*range(7)], [*range(7, 14)], [*range(14, 20)]]
     assert read.episodes == 20
-    assert shards.is_set(url)
+    assert shards.Shards.is_at(url)
     assert not any((tmp_path / "out").iterdir())
     if where == "memory":
         fsspec.filesystem("memory").rm("/set-of-numbers", recursive=True)

@@ -54,7 +54,7 @@ def forge(submitted, tmp_path):
     """Writes the valid submission with changed facts or arrays, and verifies it."""
 
     def of(about=None, **changes):
-        honest = recordings.read(submitted()[1])
+        honest = recordings.Recording.read(submitted()[1])
         forged = replace(honest, about=honest.about | (about or {}), **changes)
         return verify(files.write(tmp_path / "forged.npz", forged.to_bytes()), EPISODES)
 
@@ -80,7 +80,7 @@ def test_an_honest_submission_has_the_row_of_its_evaluation(physics, submitted):
 
 
 def test_an_episode_without_a_plan_has_failed_at_the_full_price(submitted, tmp_path):
-    honest = recordings.read(submitted()[1])
+    honest = recordings.Recording.read(submitted()[1])
     first = honest.lengths[0]
     gave_up = replace(
         honest, lengths=changed(honest.lengths, 0, 0), states=honest.states[first + 1 :], actions=honest.actions[first:]
@@ -90,7 +90,7 @@ def test_an_episode_without_a_plan_has_failed_at_the_full_price(submitted, tmp_p
 
 
 def test_a_teleport_of_a_millimetre_is_refused(forge, submitted):
-    honest = recordings.read(submitted()[1])
+    honest = recordings.Recording.read(submitted()[1])
     states, rest = honest.states, slice(30, honest.lengths[0] + 1)
     with pytest.raises(
         SubmissionError, match=r"episode 0, step 30: the next state does not follow: x is off by 0\.001 m"
@@ -103,14 +103,14 @@ def test_a_teleport_of_a_millimetre_is_refused(forge, submitted):
 
 
 def test_a_changed_start_is_refused(forge, submitted):
-    honest = recordings.read(submitted()[1])
+    honest = recordings.Recording.read(submitted()[1])
     start = changed(honest.states, (0, 0), honest.states[0, 0] + 2e-8)
     with pytest.raises(SubmissionError, match=r"episode 0, step 0: it does not begin at its certified start$"):
         forge(states=start)
 
 
 def test_another_action_and_one_beyond_its_limit_are_refused(forge, submitted):
-    actions = recordings.read(submitted()[1]).actions
+    actions = recordings.Recording.read(submitted()[1]).actions
     with pytest.raises(SubmissionError, match=r"episode 0, step 4: the action \[1\.25, .*\] is beyond its limit of 1"):
         forge(actions=changed(actions, (3, 0), 1.25))
     with pytest.raises(SubmissionError, match="episode 0, step 4: the next state does not follow"):
@@ -118,7 +118,7 @@ def test_another_action_and_one_beyond_its_limit_are_refused(forge, submitted):
 
 
 def test_an_end_that_is_none_is_refused(forge, submitted):
-    honest = recordings.read(submitted()[1])
+    honest = recordings.Recording.read(submitted()[1])
     shorter = {"lengths": honest.lengths - [0, 3], "states": honest.states[:-3], "actions": honest.actions[:-3]}
     with pytest.raises(
         SubmissionError, match=r"episode 1, step \d+: the recording stops here, but the episode has not"
@@ -172,7 +172,7 @@ def test_what_a_file_says_about_itself_is_checked(about, why, forge):
 
 
 def test_a_motion_of_another_engine_is_refused(submitted, tmp_path):
-    honest = recordings.read(submitted("bullet")[1])
+    honest = recordings.Recording.read(submitted("bullet")[1])
     renamed = replace(honest, about=honest.about | {"physics": "rk4"})
     path = files.write(tmp_path / "renamed.npz", renamed.to_bytes())
     with pytest.raises(SubmissionError, match="episode 0, step 1: the next state does not follow"):
@@ -185,7 +185,7 @@ def test_too_few_episodes_are_refused(submitted):
 
 
 def test_a_folder_of_several_controllers_must_be_told_which(submitted, tmp_path):
-    honest = recordings.read(submitted()[1])
+    honest = recordings.Recording.read(submitted()[1])
     for name in ("a", "b"):
         told = replace(honest, about=honest.about | {"controller": name})
         files.write(tmp_path / recordings.FOLDER / f"{name}.npz", told.to_bytes())
@@ -206,9 +206,9 @@ def test_motions_survive_the_way_through_bytes_and_file(rng, tmp_path):
         recordings.Recording({}, np.array([n]), *(grid * part for grid, part in zip(grids, motion, strict=True)))
         for n, motion in zip(lengths, motions, strict=True)
     ]
-    arrived = [recordings.read("bytes", each.to_bytes()) for each in made]
+    arrived = [recordings.Recording.read("bytes", each.to_bytes()) for each in made]
     ran = make_task("turn"), "turn", named_robot("paper"), "rk4", "mine"
-    joined = recordings.read(recordings.write_in(tmp_path, arrived, *ran))
+    joined = recordings.Recording.read(recordings.Recording.of_run(arrived, *ran).write_in(tmp_path))
     assert joined.lengths.tolist() == lengths
     everything = tuple(map(np.concatenate, zip(*motions, strict=True)))
     for read, wanted in [*zip(arrived, motions, strict=True), (joined, everything)]:
@@ -218,7 +218,7 @@ def test_motions_survive_the_way_through_bytes_and_file(rng, tmp_path):
 
 def test_of_a_simulation_that_exploded_what_no_number_holds_is_cut_off():
     exploded = recordings.Recording({}, np.array([1]), np.array([8 * [0.0], 8 * [-np.inf]]), np.array([[1e200, -1.0]]))
-    read = recordings.read("bytes", exploded.to_bytes())
+    read = recordings.Recording.read("bytes", exploded.to_bytes())
     assert read.states[1].tolist() == 8 * [-(2.0**36) * recordings.GRID]
     assert read.actions[0].tolist() == [2.0**36 * recordings.ACTION_GRID, -1.0]
 
@@ -347,7 +347,8 @@ def test_a_refused_submission_replaces_and_removes_nothing(submitted, tmp_path):
         submit_command(folder, name="mine", out=out)
     assert earlier.read_bytes() == b"earlier"
     (path,) = (folder / recordings.FOLDER).glob("*.npz")
-    elsewhere = replace(recordings.read(path), about=recordings.read(path).about | {"task": "../../elsewhere"})
+    recording = recordings.Recording.read(path)
+    elsewhere = replace(recording, about=recording.about | {"task": "../../elsewhere"})
     files.write(tmp_path / "run" / recordings.FOLDER / "a.npz", elsewhere.to_bytes())
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SubmissionError, match=r"unknown task '\.\./\.\./elsewhere'"):
@@ -374,7 +375,7 @@ def test_a_row_says_whose_motion_it_is(submitted, tmp_path):
     assert entry.copies([replace(other, costs=[cost * 1.001 for cost in entry.costs])]) == []
     known = certified.load("turn", "paper", episodes=range(EPISODES))
     optima = [known.trajectories[i] for i in range(EPISODES)]
-    honest = recordings.read(submitted()[1])
+    honest = recordings.Recording.read(submitted()[1])
     replayed = replace(
         honest,
         lengths=np.array([len(optimum.u) for optimum in optima]),

@@ -81,7 +81,7 @@ def certify(
 
 
 def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str) -> None:
-    from ballbot_train.work.shards import make
+    from ballbot_train.work.shards import Shards
 
     for name in tasks:
         of = own_robot(name, robot)
@@ -92,7 +92,7 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
             **robot_setting(of),
         }
         set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, of)
-        made = make(set_url, about, episodes, function, out / name, workers, name)
+        made = Shards.make(set_url, about, episodes, function, out / name, workers, name)
         console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")
 
 

@@ -16,8 +16,9 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robot import PAPER, Randomization, Robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_parts
-from ballbot_train.evaluation import counterparts, optima, recordings
+from ballbot_train.evaluation import counterparts, optima
 from ballbot_train.evaluation.controllers import ControllerName, as_controller
+from ballbot_train.evaluation.recordings import Recording
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, write_results
 from ballbot_train.evaluation.runner import checked_episodes, run_episodes
 from ballbot_train.work.console import progress_bars
@@ -125,7 +126,7 @@ def evaluate(
         held = None if out is None else _Held.of(Path(out))
         on = name_of(env.task) or type(env.task).__name__.lower()
         named = name or ControllerName(_name(policy, file, on, held)).behind(filter).text, on
-        motions: list[recordings.Recording] = []
+        motions: list[Recording] = []
         with progress_bars({"episodes": len(indices)}, late=True) as advance:
             results = run_episodes(env, controller, *named, indices, 0, known, motions, partial(advance, "episodes"))
         (row,) = leaderboard(results)
@@ -177,7 +178,7 @@ class _Held:
         file: str,
         digest: str,
         new: Sequence[Result],
-        motions: Sequence[recordings.Recording],
+        motions: Sequence[Recording],
     ) -> None:
         """Writes the folder with the episodes of a new row, and what was done in them. Errors: see `_joined`.
 
@@ -198,7 +199,8 @@ class _Held:
         results, facts = self._joined(ran, more, new)
         write_results(leaderboard(results), results, provenance() | facts, self.out)
         if not env.randomization.active:
-            recordings.write_in(self.out, motions, env.task, task, env.params, env.physics, name, digest)
+            ran_in = env.task, task, env.params, env.physics
+            Recording.of_run(motions, *ran_in, name, digest).write_in(self.out)
 
     def _joined(
         self, ran: dict[str, Any], more: dict[str, dict[str, Any]], new: Sequence[Result]

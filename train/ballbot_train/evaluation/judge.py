@@ -52,74 +52,75 @@ class Steps:
             i = int(np.argmax(where))
             raise SubmissionError(f"{self.path}: episode {self.episode[i]}, step {self.step[i]}: {why(i)}")
 
+    def judged(
+        self, physics: str, task: Task, robot: Robot, known: certified.EvaluationSet
+    ) -> tuple[list[float], list[str]]:
+        """Cost and end of every episode.
 
-def judged(
-    steps: Steps, physics: str, task: Task, robot: Robot, known: certified.EvaluationSet
-) -> tuple[list[float], list[str]]:
-    """Cost and end of every episode of a recording that breaks no rule."""
-    _check_starts(steps, known)
-    longest = steps.lengths[steps.episode] > task.steps
-    steps.refuse(longest, lambda i: f"the episode is longer than its {task.steps} control steps")
-    steps.refuse(
-        np.abs(steps.action).max(1) > 1, lambda i: f"the action {steps.action[i].tolist()} is beyond its limit of 1"
-    )
-    force = robot.force_limit * steps.action
-    simulated = robot.CONTACT and physics != "rk4"
-    tolerance = CONTACT_TOLERANCE if simulated else TOLERANCE
-    reached, slip = stepped(physics, robot, task, steps.before, force)
-    error = steps.after - reached
-    missed = np.abs(error)
-    steps.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated, robot))
-    steps.refuse(~(slip <= SLIP_TOLERANCE), lambda i: f"the ball slips at {slip[i]:.2g} m/s. {_SLIPS}")
-    c = known.constants[steps.episode]
-    limits = robot.limits(steps.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
-    grip = (np.minimum.reduce(limits),) if limits else ()
-    did = outcome(task, steps.before, force, steps.after, c, steps.step, grip)
-    over = np.broadcast_to(did.terminated + did.truncated > 0, steps.step.shape)
-    last = steps.step == steps.lengths[steps.episode]
-    steps.refuse(over & ~last, lambda i: "the episode has ended here, but the recording continues")
-    steps.refuse(last & ~over, lambda i: "the recording stops here, but the episode has not ended")
-    n = len(steps.lengths)
-    cost = np.bincount(steps.episode, np.broadcast_to(did.cost, steps.step.shape), n)
-    cost[steps.lengths == 0] = task.survival_pay
-    _check_errors(steps, task, robot, known, error, cost)
-    ends, names = [NO_PLAN] * n, limit_names(task, robot)
-    for i in np.flatnonzero(last):
-        violated = int(did.violated[i])
-        ends[steps.episode[i]] = names[violated] if violated >= 0 else SUCCESS if did.success[i] > 0 else MISSED
-    return cost.tolist(), ends
+        Raises:
+            SubmissionError: the recording breaks a rule.
+        """
+        self._check_starts(known)
+        longest = self.lengths[self.episode] > task.steps
+        self.refuse(longest, lambda i: f"the episode is longer than its {task.steps} control steps")
+        self.refuse(
+            np.abs(self.action).max(1) > 1, lambda i: f"the action {self.action[i].tolist()} is beyond its limit of 1"
+        )
+        force = robot.force_limit * self.action
+        simulated = robot.CONTACT and physics != "rk4"
+        tolerance = CONTACT_TOLERANCE if simulated else TOLERANCE
+        reached, slip = stepped(physics, robot, task, self.before, force)
+        error = self.after - reached
+        missed = np.abs(error)
+        self.refuse(~(missed.max(1) <= tolerance), lambda i: _jump(missed[i], tolerance, simulated, robot))
+        self.refuse(~(slip <= SLIP_TOLERANCE), lambda i: f"the ball slips at {slip[i]:.2g} m/s. {_SLIPS}")
+        c = known.constants[self.episode]
+        limits = robot.limits(self.before, force, hold=task.control_dt) if robot.grips and not simulated else ()
+        grip = (np.minimum.reduce(limits),) if limits else ()
+        did = outcome(task, self.before, force, self.after, c, self.step, grip)
+        over = np.broadcast_to(did.terminated + did.truncated > 0, self.step.shape)
+        last = self.step == self.lengths[self.episode]
+        self.refuse(over & ~last, lambda i: "the episode has ended here, but the recording continues")
+        self.refuse(last & ~over, lambda i: "the recording stops here, but the episode has not ended")
+        n = len(self.lengths)
+        cost = np.bincount(self.episode, np.broadcast_to(did.cost, self.step.shape), n)
+        cost[self.lengths == 0] = task.survival_pay
+        self._check_errors(task, robot, known, error, cost)
+        ends, names = [NO_PLAN] * n, limit_names(task, robot)
+        for i in np.flatnonzero(last):
+            violated = int(did.violated[i])
+            ends[self.episode[i]] = names[violated] if violated >= 0 else SUCCESS if did.success[i] > 0 else MISSED
+        return cost.tolist(), ends
 
+    def _check_starts(self, known: certified.EvaluationSet) -> None:
+        begun = np.flatnonzero(self.lengths)
+        starts = np.rint(self.states[self.first[begun]] / recordings.GRID)
+        wrong = begun[(starts != np.rint(known.states[begun] / recordings.GRID)).any(1)]
+        if len(wrong):
+            raise SubmissionError(f"{self.path}: episode {wrong[0]}, step 0: it does not begin at its certified start")
 
-def _check_starts(steps: Steps, known: certified.EvaluationSet) -> None:
-    begun = np.flatnonzero(steps.lengths)
-    starts = np.rint(steps.states[steps.first[begun]] / recordings.GRID)
-    wrong = begun[(starts != np.rint(known.states[begun] / recordings.GRID)).any(1)]
-    if len(wrong):
-        raise SubmissionError(f"{steps.path}: episode {wrong[0]}, step 0: it does not begin at its certified start")
+    def _check_errors(
+        self,
+        task: Task,
+        robot: Robot,
+        known: certified.EvaluationSet,
+        error: np.ndarray,
+        cost: np.ndarray,
+    ) -> None:
+        """Refuses a recording whose small errors, taken together, may have changed the cost of an episode."""
+        from ballbot_train.evaluation import steering  # it imports CasADi
 
-
-def _check_errors(
-    steps: Steps,
-    task: Task,
-    robot: Robot,
-    known: certified.EvaluationSet,
-    error: np.ndarray,
-    cost: np.ndarray,
-) -> None:
-    """Refuses a recording whose small errors, taken together, may have changed the cost of an episode."""
-    from ballbot_train.evaluation import steering  # it imports CasADi
-
-    ends = np.cumsum(steps.lengths)
-    for i in np.flatnonzero(steps.lengths):
-        n, first, end = steps.lengths[i], steps.first[i], ends[i]
-        moved = steps.states[first : first + n + 1], steps.action[end - n : end]
-        slopes = steering.costates(task, robot, *moved, known.constants[i])
-        part = float(np.abs(slopes * error[end - n : end]).sum()) / cost[i]
-        if not part <= STEERED:
-            raise SubmissionError(
-                f"{steps.path}: episode {i}: the small errors of its steps together may have changed its cost by {part:.2%}, "
-                f"and {STEERED:.2%} is allowed; record the motion as the engine gives it"
-            )
+        ends = np.cumsum(self.lengths)
+        for i in np.flatnonzero(self.lengths):
+            n, first, end = self.lengths[i], self.first[i], ends[i]
+            moved = self.states[first : first + n + 1], self.action[end - n : end]
+            slopes = steering.costates(task, robot, *moved, known.constants[i])
+            part = float(np.abs(slopes * error[end - n : end]).sum()) / cost[i]
+            if not part <= STEERED:
+                raise SubmissionError(
+                    f"{self.path}: episode {i}: the small errors of its steps together may have changed its cost by "
+                    f"{part:.2%}, and {STEERED:.2%} is allowed; record the motion as the engine gives it"
+                )
 
 
 def stepped(

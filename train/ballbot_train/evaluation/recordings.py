@@ -60,6 +60,74 @@ class Recording:
             return cls({}, np.zeros(1, np.int64), np.zeros((0, params.state_size)), np.zeros((0, params.action_size)))
         return cls({}, np.array([len(trajectory.u)]), trajectory.x, trajectory.u / params.force_limit)
 
+    @classmethod
+    def of_run(
+        cls,
+        episodes: Sequence["Recording"],
+        task: Task,
+        name: str,
+        robot: Robot,
+        physics: str,
+        controller: str,
+        policy: str = "",
+    ) -> "Recording":
+        """What was done in the first certified episodes, in order.
+
+        `name` is the task's, `policy` the digest of the controller's weights.
+        """
+        made_by = provenance()
+        about = {
+            "task": name,
+            "problem": task.problem(),
+            "robot": robot_name(robot),
+            "physics": physics,
+            "controller": controller,
+            "policy": policy,
+            "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
+        }
+        joined = (
+            np.concatenate([getattr(each, part) for each in episodes]) for part in ("lengths", "states", "actions")
+        )
+        return cls(about, *joined)
+
+    @classmethod
+    def read(cls, path: str | Path, content: bytes | None = None) -> "Recording":
+        """What `to_bytes` gave, in a file. Sizes are checked before anything is unpacked, and nothing is executed.
+
+        Args: content: as `to_bytes` gives it, if it is read already.
+
+        Raises:
+            FileError: it is missing, damaged, too large, or no recording.
+        """
+        arrays = files.read_npz(path, _LARGEST_UNPACKED, content or files.read(path, LARGEST_FILE))
+        if unknown := arrays.keys() - _ARRAYS:
+            raise files.FileError(
+                f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed"
+            )
+        if missing := _ARRAYS - arrays.keys():
+            raise files.FileError(f"{path} is not a recording: it has no array {', '.join(sorted(missing))}")
+        lengths, text = arrays["lengths"], arrays["about"]
+        if lengths.dtype != np.uint32 or lengths.ndim != 1 or text.dtype != np.uint8 or text.ndim != 1:
+            raise files.FileError(
+                f"{path} is not a recording: lengths must be uint32 and about uint8, each of one axis"
+            )
+        steps = int(lengths.sum(dtype=np.int64))
+        facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
+        sizes = _sizes_of(facts, arrays)
+        shapes = {
+            "states": (_BYTES, sizes[0], steps + int(np.count_nonzero(lengths))),
+            "actions": (_BYTES, sizes[1], steps),
+        }
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
+                raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
+        return cls(
+            facts,
+            lengths.astype(np.int64),
+            GRID * _unpacked(arrays["states"]),
+            ACTION_GRID * _unpacked(arrays["actions"]),
+        )
+
     def to_bytes(self) -> bytes:
         """The content of its file."""
         arrays = {
@@ -70,70 +138,10 @@ class Recording:
         }
         return files.npz(arrays)
 
-
-def write_in(
-    out: Path,
-    episodes: Sequence[Recording],
-    task: Task,
-    name: str,
-    robot: Robot,
-    physics: str,
-    controller: str,
-    policy: str = "",
-) -> Path:
-    """Writes what was done in the first certified episodes, in order, into a results folder.
-
-    `name` is the task's, `policy` the digest of the controller's weights.
-    """
-    made_by = provenance()
-    about = {
-        "task": name,
-        "problem": task.problem(),
-        "robot": robot_name(robot),
-        "physics": physics,
-        "controller": controller,
-        "policy": policy,
-        "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
-    }
-    joined = (np.concatenate([getattr(each, part) for each in episodes]) for part in ("lengths", "states", "actions"))
-    path = out / FOLDER / file_of(name, about["robot"], controller)
-    return files.write(path, Recording(about, *joined).to_bytes())
-
-
-def file_of(task: str, robot: str, name: str, ending: str = ".npz", physics: str = "") -> str:
-    """Name of the file of what a controller did in a task; no two controllers share one."""
-    return f"{file_name(task, robot)}-{file_part(name)}{physics and f'-{physics}'}{ending}"
-
-
-def read(path: str | Path, content: bytes | None = None) -> Recording:
-    """What `Recording.to_bytes` gave, in a file. Sizes are checked before anything is unpacked, and nothing is executed.
-
-    Args: content: as `Recording.to_bytes` gives it, if it is read already.
-
-    Raises:
-        FileError: it is missing, damaged, too large, or no recording.
-    """
-    arrays = files.read_npz(path, _LARGEST_UNPACKED, content or files.read(path, LARGEST_FILE))
-    if unknown := arrays.keys() - _ARRAYS:
-        raise files.FileError(f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed")
-    if missing := _ARRAYS - arrays.keys():
-        raise files.FileError(f"{path} is not a recording: it has no array {', '.join(sorted(missing))}")
-    lengths, text = arrays["lengths"], arrays["about"]
-    if lengths.dtype != np.uint32 or lengths.ndim != 1 or text.dtype != np.uint8 or text.ndim != 1:
-        raise files.FileError(f"{path} is not a recording: lengths must be uint32 and about uint8, each of one axis")
-    steps = int(lengths.sum(dtype=np.int64))
-    facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
-    sizes = _sizes_of(facts, arrays)
-    shapes = {
-        "states": (_BYTES, sizes[0], steps + int(np.count_nonzero(lengths))),
-        "actions": (_BYTES, sizes[1], steps),
-    }
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
-            raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
-    return Recording(
-        facts, lengths.astype(np.int64), GRID * _unpacked(arrays["states"]), ACTION_GRID * _unpacked(arrays["actions"])
-    )
+    def write_in(self, out: Path) -> Path:
+        """Writes the recording of a run into a results folder; no two controllers share a file."""
+        name = f"{file_name(self.about['task'], self.about['robot'])}-{file_part(self.about['controller'])}.npz"
+        return files.write(out / FOLDER / name, self.to_bytes())
 
 
 def _sizes_of(facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[int, int]:

@@ -23,8 +23,9 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, Randomization, Robot, named_robot, robot_setting
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation import optima, recordings
+from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.controllers import ControllerName, as_controller
+from ballbot_train.evaluation.recordings import Recording
 from ballbot_train.evaluation.results import Result, Row, table_cells, write_results
 from ballbot_train.policy.files import PolicyFile, shipped_ways
 from ballbot_train.work import jobs
@@ -213,11 +214,11 @@ def run_groups(
     for group, some in zip(groups, work, strict=True):
         entries = [entry for _ in some for entry in next(done)]
         if record:
-            motions = [recordings.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
+            motions = [Recording.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
             policy = ControllerName(group.controller).file(task, group.robot)
             who = group.physics, group.controller, "" if policy is None else policy.weights_digest()
-            recordings.write_in(out, motions, task, group.task, params, *who)
+            Recording.of_run(motions, task, group.task, params, *who).write_in(out)
         results += [Result(**{**entry, "labels": group.labels}) for entry in entries]
     return results
 
@@ -265,7 +266,7 @@ def _episode_entries(
     if getattr(made, "senses", False):
         world["observation"] = "sensors"
     env = BallbotEnv(group.task, physics=group.physics, **world)
-    motions: list[recordings.Recording] | None = [] if record else None
+    motions: list[Recording] | None = [] if record else None
     results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)
     env.close()
     for i, result in enumerate(results):
@@ -290,7 +291,7 @@ def run_episodes(
     episodes: Iterable[int],
     seed: int = 0,
     known: certified.EvaluationSet | None = None,
-    motions: list[recordings.Recording] | None = None,
+    motions: list[Recording] | None = None,
     advance: Callable[[int], None] = lambda count: None,
 ) -> list[Result]:
     """Runs certified episodes under any controller; one that finds no plan has failed the episode. torch computes on one
@@ -336,7 +337,7 @@ def run_episodes(
                 "effort": float(np.hypot.reduce(run.trajectory.u, axis=1).mean()),
             }
         if motions is not None:
-            motions.append(recordings.Recording.of_episode(None if run is None else run.trajectory, env.params))
+            motions.append(Recording.of_episode(None if run is None else run.trajectory, env.params))
         results.append(Result(task, name, i, env.physics, optimum=float(known.costs[i]), **measures))
         advance(1)
     return results

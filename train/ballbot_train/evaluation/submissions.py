@@ -22,11 +22,12 @@ from ballbot_gym import certified, files
 from ballbot_gym.certified import version
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import ROBOTS, named_robot
+from ballbot_gym.robot import ROBOTS, file_name, named_robot
 from ballbot_gym.step import limit_names
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import recordings
-from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError, judged
+from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError
+from ballbot_train.evaluation.names import file_part
 from ballbot_train.evaluation.results import Result, leaderboard, to_json, with_interval
 
 LEAST_REGRET = {"rk4": (-1e-3, -1e-4), "bullet": (-0.01, -0.002), "mujoco": (-0.01, -0.002)}
@@ -144,8 +145,8 @@ class Entry:
     @property
     def file(self) -> str:
         """Name of its file."""
-        physics = "" if self.physics == next(iter(PHYSICS)) else self.physics
-        return recordings.file_of(self.task, self.robot, self.name, ".json", physics)
+        physics = "" if self.physics == next(iter(PHYSICS)) else f"-{self.physics}"
+        return f"{file_name(self.task, self.robot)}-{file_part(self.name)}{physics}.json"
 
     def write(self, folder: Path) -> Path:
         """Writes it as JSON.
@@ -212,7 +213,7 @@ def pack(results: Path, name: str, link: str, controller: str = "") -> dict[str,
         ValueError: there is no recording in it, or one of several controllers.
     """
     paths = sorted((results / recordings.FOLDER).glob("*.npz"))
-    found = [(path, recordings.read(path)) for path in paths]
+    found = [(path, recordings.Recording.read(path)) for path in paths]
     names = list(dict.fromkeys(str(recording.about.get("controller")) for _, recording in found))
     if not found:
         raise ValueError(
@@ -245,11 +246,11 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
 
     Raises:
         SubmissionError: it breaks a rule; the message names the episode, the control step and the reason.
-        FileError: as `recordings.read`.
+        FileError: as `Recording.read`.
         ImportError: its physics is not installed.
     """
     content = files.read(path, recordings.LARGEST_FILE) if content is None else content
-    recording = recordings.read(path, content)
+    recording = recordings.Recording.read(path, content)
     facts = _checked_facts(recording.about, path)
     robot = named_robot(facts["robot"])
     task = make_task(facts["task"], facts["robot"])
@@ -261,7 +262,7 @@ def verify(path: str | Path, episodes: int = certified.EPISODES, content: bytes 
         raise SubmissionError(f"{path} holds {len(recording.lengths)} episodes, and not {episodes}")
     known = certified.load(task, robot, episodes=range(episodes))
     steps = Steps(recording, path)
-    costs, ends = judged(steps, facts["physics"], task, robot, known)
+    costs, ends = steps.judged(facts["physics"], task, robot, known)
     rounded = [float(f"{cost:.9g}") for cost in costs]  # more digits differ between machines
     digest = hashlib.sha256(content).hexdigest()
     entry = Entry(**{key: facts[key] for key in _FACTS}, submission=digest, costs=rounded, ends=ends)

@@ -89,7 +89,7 @@ def load_demos(path: str | Path, task: Task, robot: str = PAPER) -> Demos:
     """
     _check_made_for(str(path), metadata_of(path), task, robot)
     try:
-        arrays = _sharded(path) if shards.is_set(path) else _dataset(Path(path))
+        arrays = _sharded(path) if shards.Shards.is_at(path) else _dataset(Path(path))
         return _demos(arrays, len(task.observation_scale))
     except Exception as error:  # h5py has dozens of ways to refuse a damaged file
         raise ValueError(f'{path} is damaged; record it again with "ballbot demos" ({error!r:.300})') from error
@@ -176,7 +176,7 @@ def command_of(path: str | Path) -> str:
         ValueError: it is no such dataset.
     """
     settings, options = metadata_of(path)["demos"], {"out": str(path)}
-    if shards.is_set(path):
+    if shards.Shards.is_at(path):
         settings, options = {"episodes": shards.Shards(path).episodes} | settings, {"shards": str(path)}
     words = ["ballbot", "demos", *itertools.chain(*itertools.starmap(option, (settings | options).items()))]
     return shlex.join(words)
@@ -185,7 +185,7 @@ def command_of(path: str | Path) -> str:
 def metadata_of(path: str | Path) -> dict[str, Any]:
     """Metadata of a dataset of `ballbot demos`; raises a ValueError for anything else."""
     try:
-        if shards.is_set(path):
+        if shards.Shards.is_at(path):
             metadata = shards.Shards(path).about or {}
         else:
             metadata = files.read_json(Path(path) / "data" / "metadata.json")

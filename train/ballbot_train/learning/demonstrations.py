@@ -276,7 +276,7 @@ def write_shards(
         **_content(config),
     }
     named = f"{config.task} {config.expert}"
-    return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, named, per_shard)
+    return shards.Shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, named, per_shard)
 
 
 def _recorded(config: DemoConfig, episodes: Sequence[int]) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.evaluation import fresh
-from ballbot_train.policy.network import Routes, farther_choices
+from ballbot_train.policy.network import Routes
 from ballbot_train.work.console import console
 
 EPISODES = 60_000
@@ -77,7 +77,7 @@ def _predicted_regrets(task: Task, params: Robot, seed: int, episodes: int) -> t
     obstacles = [cast(np.ndarray, task.passed_obstacles(each)) for each in c]  # x, y and the distance to keep, m
     route = FRAMES[task.routed_frame].route
     assert route is not None
-    farther = np.array(farther_choices(route.obstacles), int)
+    farther = np.array(Routes.choices(route.obstacles), int)
     regrets = np.full((episodes, len(farther)), 100.0)
     counts = np.array([len(each) for each in obstacles])
     for count in np.unique(counts):

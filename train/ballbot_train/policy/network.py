@@ -199,7 +199,13 @@ class Routes(torch.nn.Module):
         self.route = route
         self.mlp = linear_layers((3 * route.obstacles, *hidden, 2**route.obstacles), torch.nn.Tanh, **own)
         self._choices: torch.Tensor
-        self.register_buffer("_choices", torch.tensor(farther_choices(route.obstacles), **own), persistent=False)
+        self.register_buffer("_choices", torch.tensor(self.choices(route.obstacles), **own), persistent=False)
+
+    @staticmethod
+    @functools.cache
+    def choices(obstacles: int) -> tuple[tuple[float, ...], ...]:
+        """Every choice of obstacles that are passed on their farther side, −1, in the order of the outputs."""
+        return tuple(itertools.product((1.0, -1.0), repeat=obstacles))
 
     def layout(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 3 n) x, y and radius of every obstacle as seen from the goal, of observations (..., no)."""
@@ -215,18 +221,12 @@ class Routes(torch.nn.Module):
             best = self.mlp(_stacked(self.route.layout(seen), self._choices)).argmax(-1)
             if isinstance(seen[0], torch.Tensor):
                 return self.route.sides(seen, self._choices[best].unbind(-1))
-            return self.route.sides(seen, farther_choices(self.route.obstacles)[int(best)])
+            return self.route.sides(seen, self.choices(self.route.obstacles)[int(best)])
 
 
 def _stacked(values: Sequence[Any], like: torch.Tensor) -> torch.Tensor:
     """(..., n) of n tensors (...), or of n plain numbers a tensor as another one is."""
     return torch.stack(tuple(values), -1) if isinstance(values[0], torch.Tensor) else like.new_tensor(values)
-
-
-@functools.cache
-def farther_choices(obstacles: int) -> tuple[tuple[float, ...], ...]:
-    """Every choice of obstacles that are passed on their farther side, −1, in the order of the outputs."""
-    return tuple(itertools.product((1.0, -1.0), repeat=obstacles))
 
 
 class PolicyController(ActionController):

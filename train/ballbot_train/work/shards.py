@@ -78,6 +78,11 @@ class Shards:
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise files.FileError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set again") from error
 
+    @staticmethod
+    def is_at(path: str | Path) -> bool:
+        """Whether a path is the URL or the folder of a set."""
+        return "://" in str(path) or (Path(path) / MANIFEST).is_file()
+
     @property
     def numbers(self) -> list[int]:
         """Of the finished shards, in order."""
@@ -138,6 +143,81 @@ class Shards:
         else:  # objects appear whole
             self._files.pipe_file(path, content)
 
+    @classmethod
+    def make(
+        cls,
+        url: str,
+        about: Mapping[str, Any],
+        episodes: int,
+        function: Callable[[range], Arrays],
+        out: Path,
+        workers: int | Workers,
+        named: str,
+        per_shard: int = EPISODES,
+    ) -> "Shards":
+        """Makes what is missing of a set, episode by episode on workers, and keeps nothing of a shard that is written.
+
+        Args:
+            url: of the set.
+            about: what decides the episodes besides their numbers; anything that JSON holds.
+            episodes: how many, from number 0.
+            function: of a module, or a partial of one. On a worker it gives the arrays of episodes of these numbers by name,
+                or none. They are joined along their first axis.
+            out: folder of this machine for what is unfinished, by which a killed run continues.
+            workers: a number of processes, or `Workers`.
+            named: what the progress bar calls it.
+            per_shard: episodes of a shard.
+
+        Raises:
+            ValueError: the set is made from something else, or another process is making it.
+            WorkerError: processes died, so that episodes are missing.
+        """
+        shards = cls(url)
+        about = {**about, "per_shard": per_shard}
+        run = jobs.RunFolder(out, "set.json")
+        run.claim({"shards": url, **about})
+        if shards.about is None:
+            shards.about = about
+            shards.write_manifest()
+        else:
+            jobs.check_same(shards.about, about, Path(url), "a set")
+
+        def parts_of(shard: int) -> dict[range, Path]:
+            """The parts of a shard, and the files in which those are kept that are there."""
+            last = min((shard + 1) * per_shard, episodes)
+            parts = (range(start, min(start + _CHUNK, last)) for start in range(shard * per_shard, last, _CHUNK))
+            return {part: run.unfinished / f"{part.start:09d}-{part.stop:09d}.npz" for part in parts}
+
+        def missing() -> Iterator[Any]:
+            for shard in range(-(-episodes // per_shard)):
+                parts = parts_of(shard)
+                finished = shards.has(shard, sum(map(len, parts)))
+                for part, path in parts.items():
+                    if finished or path.exists():
+                        advance(named, len(part))
+                    else:
+                        yield part, function, (part,)
+                join(shard)  # a killed run may have had all of it
+
+        def join(shard: int) -> None:
+            """Writes a shard if all of it is there."""
+            parts = parts_of(shard)
+            if not all(path.exists() for path in parts.values()):
+                return
+            read = [arrays for path in parts.values() if (arrays := files.read_npz(path))]
+            joined = {name: np.concatenate([each[name] for each in read]) for name in (read[0] if read else ())}
+            shards.write(shard, joined, sum(map(len, parts)))
+            for path in parts.values():
+                path.unlink()
+
+        with progress_bars({named: episodes}) as advance:
+            for part, arrays in completed(missing(), workers):
+                files.write(parts_of(part.start // per_shard)[part], files.npz(arrays, compressed=False))
+                advance(named, len(part))
+                join(part.start // per_shard)
+        run.release()
+        return shards
+
 
 def _place_of(url: str) -> tuple[Any, str]:
     """The storage of a URL or of a folder, and the path in it. A folder may have any name.
@@ -158,82 +238,3 @@ def _place_of(url: str) -> tuple[Any, str]:
 
 def _name(number: int) -> str:
     return f"shard-{number:06d}.npz"
-
-
-def is_set(path: str | Path) -> bool:
-    """Whether a path is the URL or the folder of a set of shards."""
-    return "://" in str(path) or (Path(path) / MANIFEST).is_file()
-
-
-def make(
-    url: str,
-    about: Mapping[str, Any],
-    episodes: int,
-    function: Callable[[range], Arrays],
-    out: Path,
-    workers: int | Workers,
-    named: str,
-    per_shard: int = EPISODES,
-) -> Shards:
-    """Makes what is missing of a set, episode by episode on workers, and keeps nothing of a shard that is written.
-
-    Args:
-        url: of the set.
-        about: what decides the episodes besides their numbers; anything that JSON holds.
-        episodes: how many, from number 0.
-        function: of a module, or a partial of one. On a worker it gives the arrays of episodes of these numbers by name, or
-            none. They are joined along their first axis.
-        out: folder of this machine for what is unfinished, by which a killed run continues.
-        workers: a number of processes, or `Workers`.
-        named: what the progress bar calls it.
-        per_shard: episodes of a shard.
-
-    Raises:
-        ValueError: the set is made from something else, or another process is making it.
-        WorkerError: processes died, so that episodes are missing.
-    """
-    shards = Shards(url)
-    about = {**about, "per_shard": per_shard}
-    run = jobs.RunFolder(out, "set.json")
-    run.claim({"shards": url, **about})
-    if shards.about is None:
-        shards.about = about
-        shards.write_manifest()
-    else:
-        jobs.check_same(shards.about, about, Path(url), "a set")
-
-    def parts_of(shard: int) -> dict[range, Path]:
-        """The parts of a shard, and the files in which those are kept that are there."""
-        last = min((shard + 1) * per_shard, episodes)
-        parts = (range(start, min(start + _CHUNK, last)) for start in range(shard * per_shard, last, _CHUNK))
-        return {part: run.unfinished / f"{part.start:09d}-{part.stop:09d}.npz" for part in parts}
-
-    def missing() -> Iterator[Any]:
-        for shard in range(-(-episodes // per_shard)):
-            parts = parts_of(shard)
-            finished = shards.has(shard, sum(map(len, parts)))
-            for part, path in parts.items():
-                if finished or path.exists():
-                    advance(named, len(part))
-                else:
-                    yield part, function, (part,)
-            join(shard)  # a killed run may have had all of it
-
-    def join(shard: int) -> None:
-        """Writes a shard if all of it is there."""
-        parts = parts_of(shard)
-        if not all(path.exists() for path in parts.values()):
-            return
-        read = [arrays for path in parts.values() if (arrays := files.read_npz(path))]
-        joined = {name: np.concatenate([each[name] for each in read]) for name in (read[0] if read else ())}
-        shards.write(shard, joined, sum(map(len, parts)))
-        for path in parts.values():
-            path.unlink()
-
-    with progress_bars({named: episodes}) as advance:
-        for part, arrays in completed(missing(), workers):
-            files.write(parts_of(part.start // per_shard)[part], files.npz(arrays, compressed=False))
-            advance(named, len(part))
-            join(part.start // per_shard)
-    run.release()
-    return shards
