@@ -140,10 +140,10 @@ def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]
 def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
     from ballbot_train.policy.files import PolicyError, PolicySpec
-    from ballbot_train.policy.network import PolicyNetwork, load_policy, save_policy
+    from ballbot_train.policy.network import PolicyNetwork, load_policy
 
     network = PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,)))
-    path = save_policy(folder / "mine", network, {"measured": {"regret_mean": 0.1}})
+    path = network.save(folder / "mine", {"measured": {"regret_mean": 0.1}})
     return [path, path.with_suffix(".safetensors")], lambda: load_policy(path, "turn"), (PolicyError,)
 
 
@@ -154,12 +154,12 @@ def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
     from ballbot_gym.env import make_task
     from ballbot_gym.robot import default_params
     from ballbot_train.policy.files import PolicyError
-    from ballbot_train.policy.saved_models import load_actor
+    from ballbot_train.policy.saved_models import SavedModel
 
     env = gymnasium.make("BallbotTurn-v0", physics="rk4")
     path = folder / "mine.zip"
     PPO("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu").save(path)
-    return [path], lambda: load_actor(path, make_task("turn"), default_params()), (PolicyError,)
+    return [path], lambda: SavedModel.read(path).actor(make_task("turn"), default_params()), (PolicyError,)
 
 
 def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:

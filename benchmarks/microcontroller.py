@@ -21,7 +21,7 @@ from ballbot_gym.robot import PAPER, ROBOTS, Sensors, named_robot
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.export_c import LQR, export_c
-from ballbot_train.policy.printed import c_number
+from ballbot_train.policy.printed import C
 
 _STRICT = ("-std=c99", "-O2", "-Wall", "-Werror", "-ffunction-sections", "-fdata-sections")
 _ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard")
@@ -231,7 +231,7 @@ def _episode(task: str, robot: str, name: str, filtered: bool) -> dict[str, str]
         shown, place = shown[:, :9] * Sensors.SCALE, shown[0, 9:11]
     actions = np.clip(np.array(controller.forces) / params.force_limit, -1, 1)
     arrays = {"constants": np.append(c, 0), "shown": shown, "place": place, "actions": actions}
-    return {key: ", ".join(c_number(value) for value in array.ravel()) for key, array in arrays.items()}
+    return {key: ", ".join(C.number(value) for value in array.ravel()) for key, array in arrays.items()}
 
 
 if __name__ == "__main__":

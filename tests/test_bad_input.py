@@ -37,7 +37,7 @@ from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicySpec
-from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work import jobs
 
 REFUSALS = (ValueError, TypeError, gymnasium.error.Error)
@@ -309,7 +309,7 @@ def policy(weights=None, raw=None, text=None, **changes):
     def read(folder):
         torch.manual_seed(0)
         network = PolicyNetwork(PolicySpec.of(make_task("stabilize"), hidden=(4,)))
-        path = save_policy(folder / "mine", network, {})
+        path = network.save(folder / "mine", {})
         content = json.loads(path.read_text())
         content["spec"] |= changes
         content["spec"] = {key: value for key, value in content["spec"].items() if value is not MISSING}

@@ -15,7 +15,7 @@ from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.export_c import LARGEST_ERROR, LQR, export_c
 from ballbot_train.policy.files import SHIPPED
-from ballbot_train.policy.network import PolicyController, save_policy
+from ballbot_train.policy.network import PolicyController
 
 COMPILER = machine_code.compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
@@ -150,7 +150,7 @@ def test_a_compiled_filter_drives_certified_episodes_from_sensors_to_the_same_en
 def test_all_that_a_policy_can_do_is_in_the_file(task, fields, tmp_path):
     task = make_task(task)
     network = random_policy(task, (8, 6), **fields)
-    policy = save_policy(tmp_path / "mine", network, {"training": {"learner": "a */ b *\\\n/ c"}})
+    policy = network.save(tmp_path / "mine", {"training": {"learner": "a */ b *\\\n/ c"}})
     source = export_c(policy, tmp_path / "mine.c", task)
     compiled = Compiled(source, task, PolicyController(task, default_params(), network))
     rollout(BallbotEnv(task, physics="rk4"), compiled, seed=1)
@@ -178,7 +178,7 @@ def test_lqr_that_differs_from_episode_to_episode_is_refused(tmp_path):
 def test_a_state_that_is_no_number_gives_no_force_and_a_flag(bad, flags, tmp_path):
     task = make_task("orbit")
     network = random_policy(task, (8,), history=2)
-    source = export_c(save_policy(tmp_path / "mine", network, {}), tmp_path / "mine.c", task)
+    source = export_c(network.save(tmp_path / "mine", {}), tmp_path / "mine.c", task)
     code = ctypes.CDLL(str(built(source, tmp_path / "mine.so", "-fPIC", "-shared", *flags)))
     pointer = np.ctypeslib.ndpointer(np.float32)
     code.ballbot_observe.argtypes, code.ballbot_act.argtypes = (
@@ -232,7 +232,7 @@ def test_a_filter_starts_anew_after_a_reading_that_is_no_number(bad, tmp_path):
 def test_two_controllers_are_in_one_program_of_c_or_cpp(tmp_path):
     task = make_task("stabilize")
     export_c(LQR, tmp_path / "left.c", task, prefix="left")
-    policy = save_policy(tmp_path / "mine", random_policy(task, (8,)), {})
+    policy = random_policy(task, (8,)).save(tmp_path / "mine", {})
     export_c(policy, tmp_path / "right.c", task, prefix="right")
     text = """
         #define LEFT_HEADER

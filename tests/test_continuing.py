@@ -26,7 +26,7 @@ from ballbot_train.learning import apg, training
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicySpec
-from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work import jobs
 
 PAPER = named_robot("paper")
@@ -161,14 +161,14 @@ def test_a_run_is_not_continued_after_its_urdf_was_edited(tmp_path: Path, monkey
 @pytest.mark.parametrize("part", ["weights", "description"])
 def test_a_run_is_not_continued_with_another_policy_in_the_same_file(part: str, tmp_path: Path) -> None:
     spec = PolicySpec.of(Stabilize(), hidden=(4,))
-    path, out = save_policy(tmp_path / "policy", PolicyNetwork(spec), {}), tmp_path / "out"
+    path, out = PolicyNetwork(spec).save(tmp_path / "policy", {}), tmp_path / "out"
     chosen = {"paper": {"stabilize": [str(path)]}}
     open_run(out, 1, chosen, episodes=5)
     jobs.RunFolder(out).unfinished.mkdir()
     (jobs.RunFolder(out).unfinished / "job.json").write_text("[]")
     open_run(out, 1, chosen, episodes=5)
     if part == "weights":
-        save_policy(path, PolicyNetwork(spec), {})
+        PolicyNetwork(spec).save(path, {})
     else:
         document = json.loads(path.read_text())
         document["spec"]["activation"] = "relu"

@@ -24,7 +24,7 @@ from ballbot_train.evaluation import controllers, evaluate, runner
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.results import TABLE, leaderboard, read_results, table_cells, write_results
 from ballbot_train.policy.files import PolicySpec, shipped_policies
-from ballbot_train.policy.network import PolicyNetwork, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work import console
 
 
@@ -160,13 +160,13 @@ def test_a_function_a_model_and_a_controller_that_do_the_same_cost_the_same(make
 
 def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
     task = make_task("stabilize")
-    path = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, hidden=(8,))), {})
+    path = PolicyNetwork(PolicySpec.of(task, hidden=(8,))).save(tmp_path / "mine", {})
     assert evaluate.evaluate(path, "stabilize", 1, "rk4").controller == f"{path.parent.name}/{path.name}"
     assert evaluate.evaluate("lqr", "stabilize", 1, "rk4").success == 1
 
 
 def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
-    path = str(save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {}))
+    path = str(PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))).save(tmp_path / "mine", {}))
     chosen = controllers.controllers_of(["stabilize", "turn"], ["lqr", path])
     assert chosen == {"paper": {"stabilize": ["lqr"], "turn": ["lqr", path]}}
     assert controllers.controllers_of(["stabilize", "turn"], [path]) == {"paper": {"turn": [path]}}

@@ -16,7 +16,7 @@ from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.runner import open_run
 from ballbot_train.policy.files import PolicyError, PolicyFile, PolicySpec
-from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work import jobs
 
 PAPER = named_robot("paper")
@@ -130,7 +130,7 @@ def test_a_task_may_refuse_states_that_no_episode_reaches() -> None:
 
 
 def test_a_policy_of_an_earlier_version_is_read_by_name_and_size(tmp_path: Path) -> None:
-    path = save_policy(tmp_path / "policy", PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))), {})
+    path = PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))).save(tmp_path / "policy", {})
     document = json.loads(path.read_text())
     for field in ("robot_numbers", "observation_digest"):
         del document["spec"][field]
@@ -165,12 +165,12 @@ def test_a_policy_is_read_for_the_numbers_of_its_robot_and_not_for_its_name(
     light, heavy = replace(PAPER, body_mass=12.0), replace(PAPER, body_mass=30.0, force_limit=900.0)
     monkeypatch.setitem(ROBOTS, "mine", Registered(light, {}))
     task = Stabilize()
-    path = save_policy(tmp_path / "policy", PolicyNetwork(PolicySpec.of(task, "mine", hidden=(4,))), {})
+    path = PolicyNetwork(PolicySpec.of(task, "mine", hidden=(4,))).save(tmp_path / "policy", {})
     load_policy(path)
     monkeypatch.setitem(ROBOTS, "mine", Registered(heavy, {}))
     for read in (
         load_policy,
-        lambda path: load_network(path, task, robot=None),
+        lambda path: PolicyNetwork.load(path, task, robot=None),
         lambda path: export(str(path), robot="mine"),
     ):
         with pytest.raises(PolicyError, match=r"with body_mass=12.0, force_limit=350.0, and .* body_mass=30.0"):
@@ -179,7 +179,7 @@ def test_a_policy_is_read_for_the_numbers_of_its_robot_and_not_for_its_name(
 
 def test_a_policy_is_read_for_its_observation_and_not_for_its_size(tmp_path: Path) -> None:
     spec = PolicySpec.of(named_as_stabilize(Blurred), hidden=(4,))
-    path = save_policy(tmp_path / "policy", PolicyNetwork(spec), {})
+    path = PolicyNetwork(spec).save(tmp_path / "policy", {})
     load_policy(path, named_as_stabilize(Blurred))
     with pytest.raises(PolicyError, match="was trained on other observations"):
         load_policy(path, Stabilize())
@@ -197,7 +197,7 @@ def test_shipped_policies_say_their_robot_and_observation() -> None:
 
 def test_a_runs_folder_is_its_policy_and_a_checkpoint_of_others_is_named(tmp_path: Path) -> None:
     run = tmp_path / "run-1"
-    save_policy(run / "policy", PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))), {})
+    PolicyNetwork(PolicySpec.of(Stabilize(), hidden=(4,))).save(run / "policy", {})
     rows = [evaluate(path, "stabilize", 1, "rk4").cost_mean for path in (str(run), run / "policy.json")]
     assert rows[0] == rows[1]
     with pytest.raises(

@@ -17,7 +17,7 @@ from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.model_free import demos_in_frame
 from ballbot_train.policy.files import shipped_policies
-from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 
 SHARED = {"gamma": 0.995, "final_gamma": 0.999, "iterations": 3, "num_envs": 4, "hidden": (16, 8)}
 RELATIVE = {"relative_advantages": False, "relative_values": False}
@@ -73,9 +73,9 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
     task, learner = make_task("stabilize"), make(name)
     run(learner, 1)
     observation = np.random.default_rng(0).normal(size=(100, 8)).astype(np.float32)
-    save_policy(tmp_path / "policy", learner.network, {})
+    learner.network.save(tmp_path / "policy", {})
     with torch.no_grad():
-        actions = load_network(tmp_path / "policy", task)(torch.as_tensor(observation))
+        actions = PolicyNetwork.load(tmp_path / "policy", task)(torch.as_tensor(observation))
     expected, _ = learner._model.predict(observation, deterministic=True)
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
 
@@ -162,7 +162,7 @@ def test_demonstrations_without_pay_cost_what_the_episodes_did(name):
     """One episode arrives or rests, one falls, one is cut short by the next."""
     task = make_task(name)
     env = BallbotEnv(task, physics="rk4")
-    network = load_network(next(iter(shipped_policies(task).values())), task)
+    network = PolicyNetwork.load(next(iter(shipped_policies(task).values())), task)
     rewards, costs, ends = [], [], []
     for seed, act in ((0, network), (1, lambda seen: torch.ones(2)), (2, network)):
         observation, info = env.reset(seed=seed)

@@ -12,7 +12,7 @@ from ballbot_gym.robot import named_robot
 from ballbot_train.commands.export import export
 from ballbot_train.policy.export_onnx import export_onnx
 from ballbot_train.policy.files import SHIPPED, PolicyFile, PolicySpec, track_in
-from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
+from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy
 
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 
@@ -70,7 +70,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
 def test_frame_routes_mirrors_and_oddness_are_inside_the_graph(task, fields, tmp_path):
     task = make_task(task)
     network = random_policy(task, **fields)
-    policy = save_policy(tmp_path / "mine", network, {})
+    policy = network.save(tmp_path / "mine", {})
     runtime = session(export_onnx(policy, tmp_path / "mine.onnx", task))
     observations = np.random.default_rng(0).normal(size=(100, len(task.observation_scale))).astype(np.float32)
     expected = PolicyController(task, None, network).predict(observations)[0]
@@ -84,7 +84,7 @@ def test_frame_routes_mirrors_and_oddness_are_inside_the_graph(task, fields, tmp
 def test_the_file_says_what_it_takes_and_gives_and_names_its_robot(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     task = make_task("turn", "kugle")
-    policy = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
+    policy = PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))).save(tmp_path / "mine", {})
     with pytest.raises(ValueError, match=r"of the robot kugle, which is none of .* give --task, or another --robot"):
         export(str(policy))
     with pytest.raises(ValueError, match="was trained on"):

@@ -22,8 +22,8 @@ from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.files import BEST, SHIPPED, PolicyError, PolicySpec, shipped_policies
-from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
-from ballbot_train.policy.printed import javascript_function
+from ballbot_train.policy.network import PolicyNetwork
+from ballbot_train.policy.printed import JAVASCRIPT
 from ballbot_train.report import playground
 from ballbot_train.report.playground import SCENARIOS, engine_script, playground_page
 
@@ -63,7 +63,7 @@ def start_of(scenario, task):
 
 def in_double(path, task, params):
     """A policy as a controller whose network computes in double precision."""
-    network = load_network(path, task).eval().double()
+    network = PolicyNetwork.load(path, task).eval().double()
 
     def action(observation, begins):
         with torch.inference_mode():
@@ -146,7 +146,7 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng
         env = BallbotEnv(name, physics="rk4")
         network = PolicyNetwork(PolicySpec.of(env.task, hidden=(8,), **fields))
         torch.nn.init.normal_(network.mlp[-1].weight, std=0.3)
-        paths.append(str(save_policy(tmp_path / name, network, {})))
+        paths.append(str(network.save(tmp_path / name, {})))
         controller = in_double(paths[-1], env.task, env.params)
         for _ in range(5):
             x, c = env.task.sample(rng, env.params)
@@ -166,7 +166,7 @@ def test_a_policy_that_sees_more_than_the_present_is_refused():
 
 def test_a_function_with_an_unknown_operation_is_refused():
     with pytest.raises(ValueError, match=r"f: the CasADi operation .* cannot be printed"):
-        javascript_function("f", lambda x: casadi.erf(x), {"x": 1})
+        JAVASCRIPT.function("f", lambda x: casadi.erf(x), {"x": 1})
 
 
 def test_a_forecast_is_what_the_policy_costs_in_the_end_and_never_less_than_the_optimum(engine, tmp_path):

@@ -17,7 +17,7 @@ from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.policy.files import BEST, PolicyError, PolicyFile, PolicySpec, shipped_policies
-from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy, save_policy
+from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_policy
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -25,7 +25,7 @@ from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_p
 def test_a_saved_policy_acts_as_before(name, squash, tmp_path):
     task = TASKS[name]()
     network = network_of(task, squash=squash, linear=squash == "tanh", activation="relu")
-    path = save_policy(tmp_path / "mine", network, {"measured": {"regret_mean": 0.1}})
+    path = network.save(tmp_path / "mine", {"measured": {"regret_mean": 0.1}})
     loaded = load_policy(path, task)
     observations = np.random.default_rng(0).normal(size=(5, len(task.observation_scale))).astype(np.float32)
     with torch.no_grad():
@@ -50,19 +50,19 @@ def test_forces_are_what_the_env_would_apply_for_the_predicted_actions(tmp_path)
 
 def test_wrong_files_are_refused_with_the_reason(tmp_path):
     task = TASKS["stabilize"]()
-    path = save_policy(tmp_path / "mine", network_of(task), {})
+    path = network_of(task).save(tmp_path / "mine", {})
     with pytest.raises(PolicyError, match=r"trained on Stabilize.*not on Turn"):
         load_policy(path, "turn")
     with pytest.raises(PolicyError, match=r"trained on Stabilize.*duration=4.0"):
         load_policy(path, TASKS["stabilize"](duration=4.0))
-    other = save_policy(tmp_path / "other", network_of(TASKS["stabilize"](duration=4.0)), {})
+    other = network_of(TASKS["stabilize"](duration=4.0)).save(tmp_path / "other", {})
     with pytest.raises(PolicyError, match=r"give that Task"):
         load_policy(other)
 
 
 def test_a_policy_is_loaded_for_the_robot_that_its_file_names(tmp_path):
     task = make_task("stabilize", "kugle")
-    path = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
+    path = PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))).save(tmp_path / "mine", {})
     controller, seen = load_policy(path), np.zeros(8)
     controller.reset(0.0, seen, np.zeros(0))
     force = controller.act(0.0, seen)

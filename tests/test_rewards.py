@@ -26,7 +26,7 @@ def policies(task, params):
     pytest.importorskip("scipy")
     from ballbot_baselines.solvers.riccati import discrete_lqr
     from ballbot_train.policy.files import shipped_policies
-    from ballbot_train.policy.network import load_network
+    from ballbot_train.policy.network import PolicyNetwork
 
     k, _ = discrete_lqr(Stabilize(), params, np.zeros(8), np.zeros(2), np.zeros(0))
     k = torch.as_tensor(k) / params.force_limit
@@ -42,7 +42,7 @@ def policies(task, params):
         "bang-bang": lambda x, o, rng: torch.sign(-(k @ x).T),
     }
     name, path = next(iter(shipped_policies(task).items()))
-    network = load_network(path, task)
+    network = PolicyNetwork.load(path, task)
     chosen[name] = lambda x, o, rng: network(o.float())
     return chosen
 

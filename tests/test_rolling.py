@@ -34,7 +34,7 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.policy.files import PolicyError, PolicySpec, shipped_policies
-from ballbot_train.policy.network import load_network, load_policy
+from ballbot_train.policy.network import PolicyNetwork, load_policy
 
 START = (0.0, 0.0, 0.2, -0.15, 0.5, -1.0, 0.3, -0.4)
 
@@ -381,7 +381,7 @@ def test_weights_to_start_from_may_be_of_another_robot_and_its_episodes():
     path = shipped_policies(make_task("orbit"))["dagger"]
     there = make_task("orbit", "rolling")
     with pytest.raises(PolicyError, match="was trained on Orbit"):
-        load_network(path, there, "rolling")
-    assert load_network(path, there, robot=None).spec.robot == "paper"
+        PolicyNetwork.load(path, there, "rolling")
+    assert PolicyNetwork.load(path, there, robot=None).spec.robot == "paper"
     with pytest.raises(PolicyError, match="was trained on Orbit, not on Turn"):
-        load_network(path, make_task("turn"), robot=None)
+        PolicyNetwork.load(path, make_task("turn"), robot=None)

@@ -28,7 +28,7 @@ from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.policy.files import PolicyError
-from ballbot_train.policy.saved_models import load_actor
+from ballbot_train.policy.saved_models import SavedModel
 
 TASK = make_task("stabilize")
 OBSERVATIONS = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
@@ -40,7 +40,7 @@ def envs():
 
 def acts(path):
     with torch.no_grad():
-        return load_actor(path, TASK, default_params())(torch.as_tensor(OBSERVATIONS)).numpy()
+        return SavedModel.read(path).actor(TASK, default_params())(torch.as_tensor(OBSERVATIONS)).numpy()
 
 
 def louder(model):
@@ -97,7 +97,7 @@ def test_a_saved_model_is_evaluated_by_its_path(tmp_path):
     with pytest.raises(ValueError, match="was made for a task with 8 observations, which is none of turn"):
         controllers_of(["turn"], [str(path)])
     with pytest.raises(PolicyError, match="takes 8 observations and gives 2 actions; BallbotTurn-v0 has 9 and 2"):
-        load_actor(path, make_task("turn"), default_params())
+        SavedModel.read(path).actor(make_task("turn"), default_params())
 
 
 def stacked(env):

@@ -29,7 +29,7 @@ from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started
 from ballbot_train.policy.export_onnx import export_onnx
 from ballbot_train.policy.files import PolicyError, PolicyFile, shipped_policies, track_in
-from ballbot_train.policy.network import load_network, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 
 
 def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
@@ -84,7 +84,7 @@ def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
     row = evaluate(learner, name, 4, "rk4", randomization=track)
     assert row.success >= described["measured"]["success"] - 0.3
     most = 95_000 if name == "weave" else 50_000  # as Weave's policies of the known robot
-    assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= most
+    assert sum(part.numel() for part in PolicyNetwork.load(path, make_task(name)).parameters()) <= most
 
 
 def test_model_of_another_library_is_shown_the_past_that_it_was_trained_with():
@@ -251,7 +251,7 @@ def test_the_first_reading_of_sensors_is_of_the_robot_that_was_given():
 def test_an_informed_policy_acts_as_its_start_at_first_and_runs_behind_a_filter(tmp_path):
     import torch
 
-    start = load_network(shipped_policies(make_task("stabilize"))["shac"], make_task("stabilize"))
+    start = PolicyNetwork.load(shipped_policies(make_task("stabilize"))["shac"], make_task("stabilize"))
     informed = started(start, replace(start.spec, informed=True))
     told = torch.tensor([[1.0, 1.0, 1.0], [1.3, 0.9, 0.9]])
     observations = torch.rand(2, 8, generator=torch.Generator().manual_seed(0)) - 0.5
@@ -260,7 +260,7 @@ def test_an_informed_policy_acts_as_its_start_at_first_and_runs_behind_a_filter(
         part.data += 0.1
     mirrored = informed(torch.cat([-observations, told], 1))
     torch.testing.assert_close(mirrored, -informed(torch.cat([observations, told], 1)))
-    path = save_policy(tmp_path / "policy", started(start, replace(start.spec, informed=True)), {})
+    path = started(start, replace(start.spec, informed=True)).save(tmp_path / "policy", {})
     named, behind = (evaluate(name, "stabilize", 3, "rk4", randomization="unknown") for name in (path, "shac-adaptive"))
     assert named.cost_mean == pytest.approx(behind.cost_mean)
     with pytest.raises(PolicyError, match="informed"):
@@ -275,12 +275,12 @@ def test_an_informed_policy_is_told_at_first_what_the_filter_knows_then_and_the_
     import torch
 
     task = make_task("stabilize")
-    start = load_network(shipped_policies(task)["shac"], task)
+    start = PolicyNetwork.load(shipped_policies(task)["shac"], task)
     informed = started(start, replace(start.spec, informed=True))
     for part in informed.parameters():
         part.data += 0.01
     firsts, episodes = [], fresh.draw(task, range(4), 3, randomization=TRACKS["unknown"])
-    for policy in (informed, save_policy(tmp_path / "policy", informed, {})):
+    for policy in (informed, informed.save(tmp_path / "policy", {})):
         given = []
         monkeypatch.setattr(fresh, "run_episodes", lambda batch, act, *_, given=given, **__: given.extend([batch, act]))
         fresh.run_policy(policy, task, *episodes, randomization=TRACKS["unknown"], dtype=torch.float64)

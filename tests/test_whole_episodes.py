@@ -13,7 +13,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import apg
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import shipped_policies
-from ballbot_train.policy.network import load_network
+from ballbot_train.policy.network import PolicyNetwork
 
 
 def made(name, seed=0, robot="paper", start=None, **settings):
@@ -48,7 +48,7 @@ def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name, symmetry)
 def test_costs_are_those_of_the_policy_s_episodes(monkeypatch):
     monkeypatch.setattr(apg, "_GOAL_PENALTY", 1e4)
     monkeypatch.setattr(apg, "_GOAL_CLEARANCE", 0.0)
-    start = load_network(shipped_policies(make_task("turn"))["ppo"], make_task("turn"))
+    start = PolicyNetwork.load(shipped_policies(make_task("turn"))["ppo"], make_task("turn"))
     learner = made("turn", start=start, num_envs=16, episode_seconds=4.6)
     state = learner._batch.state
     costs, reached = learner._episodes()

@@ -90,7 +90,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     from ballbot_gym.env import make_task
     from ballbot_train.evaluation import optima
     from ballbot_train.learning import training
-    from ballbot_train.policy.network import load_network
+    from ballbot_train.policy.network import PolicyNetwork
 
     torch.set_num_threads(run.threads)
     problem, params, out = make_task(run.task, run.robot), named_robot(run.robot), cast(Path, run.out)
@@ -100,7 +100,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     config = _config(learner, run, settings, command)
     # by which it is scored while it learns
     optima.known(problem, run.robot, workers=Workers(), randomization=varied)
-    start = None if run.start is None else load_network(run.start, problem, robot=None)
+    start = None if run.start is None else PolicyNetwork.load(run.start, problem, robot=None)
     made = LEARNERS[learner].make(problem, params, settings, run.seed, run.demos, start, *given)
     physics = physics_or_default(None, run.robot)
     row = training.train(made, problem, config, out, run.resume, run.test_episodes)

@@ -112,9 +112,9 @@ class ControllerName:
             PolicyError: the file is missing or damaged, or a saved model has observations of the task's size in other spaces.
         """
         if self._is_saved_model:
-            from ballbot_train.policy.saved_models import fits  # it imports torch
+            from ballbot_train.policy.saved_models import SavedModel  # it imports torch
 
-            return fits(self.alone, task, named_robot(robot))
+            return SavedModel.read(self.alone).fits(task, named_robot(robot))
         spec = PolicyFile(self.alone).read()["spec"]
         return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
@@ -126,9 +126,9 @@ class ControllerName:
             PolicyError: the file is missing or damaged.
         """
         if self._is_saved_model:
-            from ballbot_train.policy.saved_models import read
+            from ballbot_train.policy.saved_models import SavedModel
 
-            return f"a task with {read(self.alone).observations} observations"
+            return f"a task with {SavedModel.read(self.alone).observations} observations"
         spec = PolicyFile(self.alone).read()["spec"]
         robot = spec.get("robot", PAPER)
         return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
@@ -223,9 +223,9 @@ class ControllerName:
             raise ValueError(f"unknown controller {self.text!r}; {self.hint(task) or known}")
         if self._is_saved_model:
             from ballbot_train.policy.network import PolicyController  # it imports torch
-            from ballbot_train.policy.saved_models import load_actor
+            from ballbot_train.policy.saved_models import SavedModel
 
-            return PolicyController(task, params, load_actor(self.text, task, params))
+            return PolicyController(task, params, SavedModel.read(self.text).actor(task, params))
         from ballbot_train.policy.network import load_policy
 
         return load_policy(shipped.get(self.text, self.text), task, params)

@@ -141,9 +141,9 @@ def translated(policy: Any, named: str | Task, task: Task, params: Robot) -> Any
         if Path(policy).suffix != ".zip":
             return policy
         from ballbot_train.policy.network import PolicyController  # it imports torch
-        from ballbot_train.policy.saved_models import load_actor
+        from ballbot_train.policy.saved_models import SavedModel
 
-        return PolicyController(task, params, load_actor(policy, task, params, own))
+        return PolicyController(task, params, SavedModel.read(policy).actor(task, params, own))
     if callable(getattr(policy, "act", None)):
         return policy
     if not callable(getattr(policy, "predict", None)):

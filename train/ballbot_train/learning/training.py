@@ -56,7 +56,7 @@ from ballbot_train.evaluation.results import Row, leaderboard, near_share, succe
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.datasets import metadata_of
 from ballbot_train.policy.files import PolicyFile
-from ballbot_train.policy.network import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.policy.weights import own_defaults, saved_by_torch
 from ballbot_train.work import jobs
 from ballbot_train.work.console import console, progress_bar
@@ -321,7 +321,7 @@ class _Run:
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
             "rows": self.rows,
-            "policy": load_network(self.out / "policy", self.task, self.robot).state_dict(),
+            "policy": PolicyNetwork.load(self.out / "policy", self.task, self.robot).state_dict(),
         }
         buffer = io.BytesIO()
         torch.save(state, buffer)
@@ -329,7 +329,7 @@ class _Run:
 
     def measure(self, count: int) -> Row:
         """Measures the best policy on the first certified episodes in PyBullet, and adds the result to its JSON file."""
-        network = load_network(self.out / "policy", self.task, self.robot)
+        network = PolicyNetwork.load(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
         controller = ControllerName(str(self.out / "policy.json")).make(self.task, env.params)
         results = runner.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
@@ -353,7 +353,7 @@ class _Run:
             "training_seconds": round(self.cpu_seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),
         }
-        save_policy(self.out / "policy", network, about | more)
+        network.save(self.out / "policy", about | more)
 
     def _write_rows(self) -> None:
         files.write_csv(self.out / "evaluations.csv", self.rows)

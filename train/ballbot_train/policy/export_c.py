@@ -20,10 +20,9 @@ from ballbot_gym.lazy import imports_of
 from ballbot_gym.robot import PAPER, Robot, Sensors, named_robot
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
-from ballbot_train.policy.export_onnx import metadata
-from ballbot_train.policy.files import PolicyError, PolicySpec
-from ballbot_train.policy.network import PolicyController, PolicyNetwork, load_network
-from ballbot_train.policy.printed import c_function, c_number, layers_of, policy_function
+from ballbot_train.policy.files import PolicyError, PolicyFile, PolicySpec
+from ballbot_train.policy.network import PolicyController, PolicyNetwork
+from ballbot_train.policy.printed import C_IN_DOUBLE, C, policy_function
 from ballbot_train.policy.weights import own_defaults
 from ballbot_train.work.console import printable
 from ballbot_train.work.templates import render
@@ -65,7 +64,7 @@ def export_c(
         prefix: of all names that the file shows to others, so that one program can hold several controllers.
 
     Raises:
-        PolicyError: as `load_network`; or the policy's actions are not finite.
+        PolicyError: as `PolicyNetwork.load`; or the policy's actions are not finite.
         ValueError: the task's LQR, or where its filter expects to start, depends on the episode; or a frame or an observation
             cannot be printed; or the prefix is no name in C.
     """
@@ -76,7 +75,7 @@ def export_c(
     if policy == LQR:
         network, about = _lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
     else:
-        network, about = load_network(policy, task, robot).eval(), metadata(policy, task, robot)
+        network, about = PolicyNetwork.load(policy, task, robot).eval(), PolicyFile(policy).metadata(task, robot)
     return files.write(path, _source(network, about, task, robot, filtered, prefix))
 
 
@@ -99,7 +98,7 @@ def _lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
 
 
 def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool, prefix: str) -> str:
-    spec, params, networks = network.spec, named_robot(robot), layers_of(network)
+    spec, params, networks = network.spec, named_robot(robot), network.layers()
     source = render(
         _TEMPLATE,
         prefix=prefix,
@@ -110,17 +109,17 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         task=task,
         widest=max(weight.shape[0] for layers in networks.values() for weight, _ in layers),
         networks=networks,
-        observed=c_function(
+        observed=C.function(
             "observed",
             lambda x, c, t: task.seen(tuple(casadi.vertsplit(x)), task.at(tuple(casadi.vertsplit(c)), t), params),
             {"x": params.state_size, "c": len(task.constant_names), "t": 1},
         ),
-        acted=c_function("acted", policy_function(network), {"o": spec.seen}),
+        acted=C.function("acted", policy_function(network), {"o": spec.seen}),
         filter=_filter(task, params) if filtered else None,
         test=_test(network, task, robot, filtered),
-        largest_error=c_number(LARGEST_ERROR),
-        number=c_number,
-        numbers=lambda values: textwrap.fill(", ".join(map(c_number, values.ravel())), 120),
+        largest_error=C.number(LARGEST_ERROR),
+        number=C.number,
+        numbers=lambda values: textwrap.fill(", ".join(map(C.number, values.ravel())), 120),
         exact=lambda values: textwrap.fill(", ".join(map(repr, values.tolist())), 120),
     )
     return str(source)
@@ -145,7 +144,7 @@ def _filter(task: Task, params: Robot) -> dict[str, Any]:
         "start_variance": deviations**2,
         "model_variance": sensor_filter.model_variance,
         "reading_variance": sensor_filter.reading_variance,
-        "model": c_function("robot", robot, {"x": params.state_size, "u": params.action_size}, "double"),
+        "model": C_IN_DOUBLE.function("robot", robot, {"x": params.state_size, "u": params.action_size}),
     }
 
 

@@ -4,9 +4,7 @@ The graph is traced from `PolicyNetwork.forward`, so a policy's frame, mirror im
 """
 
 import contextlib
-import inspect
 import io
-import json
 import logging
 import warnings
 from pathlib import Path
@@ -17,10 +15,10 @@ import numpy as np
 import ballbot_gym
 from ballbot_gym import files
 from ballbot_gym.lazy import imports_of, need
-from ballbot_gym.robot import PAPER, named_robot
+from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import Task
-from ballbot_train.policy.files import OBSERVATION_VERSION, PolicyError, PolicyFile
-from ballbot_train.policy.network import PolicyNetwork, load_network
+from ballbot_train.policy.files import PolicyError, PolicyFile
+from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.policy.weights import own_defaults
 
 with imports_of(__name__):
@@ -36,7 +34,7 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
 
     The model has one input, `observation` (batch, no) float32 as the task observes, with the past behind it if the policy
     has a history, and one output, `action` (batch, 2) float32 in [−1, 1], in units of the force limit. Its metadata says what
-    these are; see `metadata`.
+    these are; see `PolicyFile.metadata`.
 
     Args:
         policy: the policy's file.
@@ -45,54 +43,17 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
         robot: by name.
 
     Raises:
-        PolicyError: as `load_network`; or the policy's actions are not finite.
+        PolicyError: as `PolicyNetwork.load`; or the policy's actions are not finite.
         ModuleNotFoundError: onnx or onnxscript is missing.
         RuntimeError: the ONNX graph acts differently from the policy.
     """
-    network = load_network(policy, task, robot).eval()
+    network = PolicyNetwork.load(policy, task, robot).eval()
     model = _traced(network)
-    for name, value in metadata(policy, task, robot).items():
+    for name, value in PolicyFile(policy).metadata(task, robot).items():
         entry = model.metadata_props.add()
         entry.key, entry.value = name, value
     _check(model, network)
     return files.write(path, model.SerializeToString())
-
-
-_FORCES = "force Fx, Fy on the ball in the world's frame, in units of force_limit_newton, in [-1, 1]"
-_TORQUES = "torque of each motor at standstill, as its pull on the ball, in units of force_limit_newton, in [-1, 1]"
-_HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's spin divided by 5 rad/s."
-
-
-def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, str]:
-    """The metadata of an ONNX file: task, layouts and units of input and output, control rate, and origin of the policy."""
-    described, params = PolicyFile(policy).read(), named_robot(robot)
-    if described["spec"].get("informed"):
-        raise PolicyError(
-            f"{policy} needs a filter that estimates its robot, and filters cannot be exported; export another policy"
-        )
-    learner = described.get("training", {}).get("learner", "unknown")
-    return {
-        "task": task.id,
-        "problem": task.problem(),
-        "robot": robot,
-        "observation": _observation_table(task) + _HEADING * bool(params.OUTPUTS),
-        "observation_scale": json.dumps(task.observation_scale),
-        "history": str(described.get("spec", {}).get("history", 0)),
-        "observation_version": str(OBSERVATION_VERSION),
-        "constants": json.dumps(task.constant_names),
-        "action": _TORQUES if params.OUTPUTS else _FORCES,
-        "force_limit_newton": repr(float(params.force_limit)),
-        "control_dt_seconds": repr(task.control_dt),
-        "learner": str(learner),
-        "weights_sha256": PolicyFile(policy).weights_digest(),
-        "ballbot_gym_version": ballbot_gym.__version__,
-    }
-
-
-def _observation_table(task: Task) -> str:
-    """The part of a task's docstring that lists its observation: number, quantity, divisor and unit, as a table."""
-    _, _, after = (inspect.getdoc(type(task)) or "").partition("Observation, ")
-    return "".join(after.partition("\n\nAction")[0])
 
 
 def _traced(network: PolicyNetwork) -> Any:

@@ -4,6 +4,8 @@ A policy is two files: weights in `NAME.safetensors` and their description in `N
 """
 
 import hashlib
+import inspect
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
+import ballbot_gym
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
 from ballbot_gym.robot import PAPER, ROBOT_FACTORS, ROBOTS, TRACKS, file_name, named_robot
@@ -31,6 +34,11 @@ _MOST_LAYERS = 64
 _MOST_MIRRORS = 16
 _MOST_UNITS = 1_000_000  # of a layer
 _DESCRIPTION_LIMIT = 2**24  # bytes
+
+_FORCES = "force Fx, Fy on the ball in the world's frame, in units of force_limit_newton, in [-1, 1]"
+_TORQUES = "torque of each motor at standstill, as its pull on the ball, in units of force_limit_newton, in [-1, 1]"
+_HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's spin divided by 5 rad/s."
+"""What the metadata of exported files says of actions, and behind an observation of its last part."""
 
 
 Activation = Literal["tanh", "relu", "silu"]
@@ -242,6 +250,35 @@ class PolicyFile:
         names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
         return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])
 
+    def metadata(self, task: Task, robot: str = PAPER) -> dict[str, str]:
+        """What exported files say: task, layouts and units of input and output, control rate, and origin of the policy.
+
+        Raises:
+            PolicyError: the policy is missing or damaged, or it needs a filter.
+        """
+        described, params = self.read(), named_robot(robot)
+        if described["spec"].get("informed"):
+            raise PolicyError(
+                f"{self.path} needs a filter that estimates its robot, and filters cannot be exported; export another policy"
+            )
+        learner = described.get("training", {}).get("learner", "unknown")
+        return {
+            "task": task.id,
+            "problem": task.problem(),
+            "robot": robot,
+            "observation": _observation_table(task) + _HEADING * bool(params.OUTPUTS),
+            "observation_scale": json.dumps(task.observation_scale),
+            "history": str(described.get("spec", {}).get("history", 0)),
+            "observation_version": str(OBSERVATION_VERSION),
+            "constants": json.dumps(task.constant_names),
+            "action": _TORQUES if params.OUTPUTS else _FORCES,
+            "force_limit_newton": repr(float(params.force_limit)),
+            "control_dt_seconds": repr(task.control_dt),
+            "learner": str(learner),
+            "weights_sha256": self.weights_digest(),
+            "ballbot_gym_version": ballbot_gym.__version__,
+        }
+
     def weights_digest(self) -> str:
         """SHA-256 of the weights, or of a saved model, as hexadecimal digits; raises a PolicyError if they are missing."""
         try:
@@ -256,6 +293,12 @@ class PolicyFile:
     def digest(self) -> str:
         """Digest of what the policy does: its weights, and the network that its description says."""
         return digest(self.weights_digest(), self.network_digest())
+
+
+def _observation_table(task: Task) -> str:
+    """The part of a task's docstring that lists its observation: number, quantity, divisor and unit, as a table."""
+    _, _, after = (inspect.getdoc(type(task)) or "").partition("Observation, ")
+    return "".join(after.partition("\n\nAction")[0])
 
 
 @lru_cache(maxsize=1)

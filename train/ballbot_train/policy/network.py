@@ -178,6 +178,84 @@ class PolicyNetwork(torch.nn.Module):
         estimates = features[self.present :] if self.spec.informed else ()
         return (*kept, *(self.spec.history * (*kept, *action)), *estimates), action
 
+    def layers(self) -> dict[str, list[tuple[np.ndarray, np.ndarray | None]]]:
+        """Weights and biases, or None, of the linear layers of its parts."""
+        parts = {"mlp": self.mlp, "linear": self.linear, "routes": self.routes}
+        return {
+            name: [
+                (layer.weight.detach().numpy(), None if layer.bias is None else layer.bias.detach().numpy())
+                for layer in (() if part is None else part.modules())
+                if isinstance(layer, torch.nn.Linear)
+            ]
+            for name, part in parts.items()
+        }
+
+    def save(self, path: str | Path, description: Mapping[str, Any]) -> Path:
+        """Writes `path`.safetensors and `path`.json.
+
+        Args:
+            path: with or without the ending .json.
+            description: what else the JSON says: the training's configuration, its command, the measured regret.
+
+        Returns:
+            The path of the JSON file.
+        """
+        file = PolicyFile(path)
+        weights = {name: tensor.detach().cpu().contiguous() for name, tensor in self.state_dict().items()}
+        files.write(file.weights, safetensors.torch.save(weights))
+        return files.write(file.description, json.dumps({"spec": asdict(self.spec), **description}, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path, task: Task, robot: str | None = PAPER) -> "PolicyNetwork":
+        """The network of a policy file made for this very task and robot.
+
+        Args:
+            path: of either of its files.
+            task: what it must have been trained on.
+            robot: by name; None admits every robot, and with it other fields of the task.
+
+        Raises:
+            PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
+        """
+        file = PolicyFile(path)
+        weights_path, description_path = file.weights, file.description
+        described = file.read()["spec"]
+        try:
+            spec = PolicySpec.read(described)
+        except (KeyError, ValueError, TypeError) as error:
+            lacks = "its spec has no " if isinstance(error, KeyError) else ""
+            raise PolicyError(f"{description_path} is not a policy: {lacks}{error}") from error
+        trained_on, wanted = (text.split("(")[0] if robot is None else text for text in (spec.task, task.problem()))
+        if trained_on != wanted:
+            raise PolicyError(f"{description_path} was trained on {trained_on}, not on {wanted}")
+        if robot is not None and spec.robot != robot:
+            raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")
+        if spec.observation_version != OBSERVATION_VERSION:
+            raise PolicyError(
+                f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
+                "train it again"
+            )
+        _check_content(description_path, spec, task)
+        observations = task.observation_size(named_robot(spec.robot))
+        if spec.observations != observations:
+            raise PolicyError(
+                f"{description_path} takes {spec.observations} observations, {task.id} has {observations}"
+            )
+        weights = _read_weights(weights_path)
+        # shapes without memory, which a wrong description would ask for
+        shapes = {name: tuple(part.shape) for name, part in cls(spec, "meta").state_dict().items()}
+        found = {name: tuple(part.shape) for name, part in weights.items()}
+        differing = [name for name in {**shapes, **found} if shapes.get(name) != found.get(name)]
+        if differing:
+            name = differing[0]
+            raise PolicyError(
+                f"{weights_path}: the weights do not fit their description: {name} has the shape {found.get(name)}, "
+                f"and should have {shapes.get(name)}"
+            )
+        network = cls(spec)
+        network.load_state_dict(weights)
+        return network
+
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
         return output if self.linear is None else output + self.linear(inputs)
@@ -257,72 +335,6 @@ class PolicyController(ActionController):
             return self.network(given).numpy(), state
 
 
-def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[str, Any]) -> Path:
-    """Writes `path`.safetensors and `path`.json.
-
-    Args:
-        path: with or without the ending .json.
-        network: the policy.
-        description: what else the JSON says: the training's configuration, its command, the measured regret.
-
-    Returns:
-        The path of the JSON file.
-    """
-    file = PolicyFile(path)
-    weights = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
-    files.write(file.weights, safetensors.torch.save(weights))
-    return files.write(file.description, json.dumps({"spec": asdict(network.spec), **description}, indent=1) + "\n")
-
-
-def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> PolicyNetwork:
-    """The network of a policy file made for this very task and robot.
-
-    Args:
-        path: of either of its files.
-        task: what it must have been trained on.
-        robot: by name; None admits every robot, and with it other fields of the task.
-
-    Raises:
-        PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
-    """
-    file = PolicyFile(path)
-    weights_path, description_path = file.weights, file.description
-    described = file.read()["spec"]
-    try:
-        spec = PolicySpec.read(described)
-    except (KeyError, ValueError, TypeError) as error:
-        lacks = "its spec has no " if isinstance(error, KeyError) else ""
-        raise PolicyError(f"{description_path} is not a policy: {lacks}{error}") from error
-    trained_on, wanted = (text.split("(")[0] if robot is None else text for text in (spec.task, task.problem()))
-    if trained_on != wanted:
-        raise PolicyError(f"{description_path} was trained on {trained_on}, not on {wanted}")
-    if robot is not None and spec.robot != robot:
-        raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")
-    if spec.observation_version != OBSERVATION_VERSION:
-        raise PolicyError(
-            f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
-            "train it again"
-        )
-    _check_content(description_path, spec, task)
-    observations = task.observation_size(named_robot(spec.robot))
-    if spec.observations != observations:
-        raise PolicyError(f"{description_path} takes {spec.observations} observations, {task.id} has {observations}")
-    weights = _read_weights(weights_path)
-    # shapes without memory, which a wrong description would ask for
-    shapes = {name: tuple(part.shape) for name, part in PolicyNetwork(spec, "meta").state_dict().items()}
-    found = {name: tuple(part.shape) for name, part in weights.items()}
-    differing = [name for name in {**shapes, **found} if shapes.get(name) != found.get(name)]
-    if differing:
-        name = differing[0]
-        raise PolicyError(
-            f"{weights_path}: the weights do not fit their description: {name} has the shape {found.get(name)}, "
-            f"and should have {shapes.get(name)}"
-        )
-    network = PolicyNetwork(spec)
-    network.load_state_dict(weights)
-    return network
-
-
 def _check_content(path: Path, spec: PolicySpec, task: Task) -> None:
     """Raises a PolicyError where another robot, or another observation, has the name of that on which a policy was trained.
 
@@ -364,7 +376,7 @@ def load_policy(path: str | Path, task: str | Task | None = None, params: Robot 
         params: the robot; default, the one that its file names.
 
     Raises:
-        PolicyError: as `load_network`; or no task is given, and its file names none that is registered.
+        PolicyError: as `PolicyNetwork.load`; or no task is given, and its file names none that is registered.
     """
     spec = PolicyFile(path).read()["spec"]
     robot = spec.get("robot", PAPER) if params is None else robot_name(params)
@@ -378,4 +390,4 @@ def load_policy(path: str | Path, task: str | Task | None = None, params: Robot 
             raise PolicyError(f"{path} was trained on {spec['task']}: give that Task as load_policy(path, task)")
     task = make_task(task, robot)
     params = named_robot(robot) if params is None else params
-    return PolicyController(task, params, load_network(path, task, robot))
+    return PolicyController(task, params, PolicyNetwork.load(path, task, robot))

@@ -6,8 +6,10 @@ double precision, and the C code in single precision.
 """
 
 import re
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,6 @@ from ballbot_train.policy.network import PolicyNetwork
 
 with imports_of(__name__):
     import casadi
-    import torch
 
 _SHARED = {
     **OPERATIONS,
@@ -86,117 +87,108 @@ def _network(i: int, inputs: casadi.SX, outputs: int) -> casadi.SX:
     return call(i, inputs)
 
 
-def layers_of(network: PolicyNetwork) -> dict[str, list[tuple[np.ndarray, np.ndarray | None]]]:
-    """Weights and biases, or None, of the linear layers of a policy's parts."""
-    parts = {"mlp": network.mlp, "linear": network.linear, "routes": network.routes}
-    return {
-        name: [
-            (layer.weight.detach().numpy(), None if layer.bias is None else layer.bias.detach().numpy())
-            for layer in (() if part is None else part.modules())
-            if isinstance(layer, torch.nn.Linear)
-        ]
-        for name, part in parts.items()
-    }
+def _number(value: float) -> str:
+    return repr(value) if value >= 0 else f"({value!r})"
 
 
-def javascript_function(name: str, function: Callable[..., Any], arguments: Mapping[str, int]) -> str:
-    """A JavaScript function that computes what a Python function computes.
-
-    Args:
-        name: of the JavaScript function.
-        function: takes CasADi columns; returns a column, a number or a tuple of numbers.
-        arguments: the name and the size of each argument.
-
-    Returns:
-        Its source. It takes arrays of numbers, and returns an array of numbers.
-
-    Raises:
-        ValueError: the function uses an operation that cannot be printed.
-    """
-    lines, returned = _printed(name, function, arguments, _JAVASCRIPT)
-    body = "\n  ".join([*lines, f"return [{', '.join(returned)}];"])
-    return f"function {name}({', '.join([*arguments, 'networks'])}) {{\n  {body}\n}}\n"
-
-
-def c_function(name: str, function: Callable[..., Any], arguments: Mapping[str, int], real: str = "float") -> str:
-    """A C99 function in single precision, or in that of another type; arguments and errors as `javascript_function`.
-
-    Returns:
-        Its source. It takes pointers to numbers, and another one, `out`, to where its results go, which are no argument's.
-    """
-    lines, returned = _printed(name, function, arguments, _C if real == "float" else _C_IN_DOUBLE)
-    takes = ", ".join(f"const {real} *{argument}" for argument in arguments)
-    body = [*lines, *(f"(void){argument};" for argument in arguments)]  # whether it is used or not
-    body += [f"out[{i}] = {value};" for i, value in enumerate(returned)]
-    return f"static void {name}({takes}, {real} *out)\n{{\n    " + "\n    ".join(body) + "\n}\n"
-
-
-def c_number(value: float) -> str:
+def _c_number(value: float) -> str:
     """A number as C, rounded to single precision."""
     text = str(np.float32(value))
     text = {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}.get(text, f"{text}f")
     return f"({text})" if text.startswith("-") else text
 
 
-def _number(value: float) -> str:
-    return repr(value) if value >= 0 else f"({value!r})"
+def _javascript(name: str, arguments: Sequence[str], lines: Sequence[str], returned: Sequence[str]) -> str:
+    """A JavaScript function. It takes arrays of numbers, and returns an array of numbers."""
+    body = "\n  ".join([*lines, f"return [{', '.join(returned)}];"])
+    return f"function {name}({', '.join([*arguments, 'networks'])}) {{\n  {body}\n}}\n"
 
 
-class _Language(NamedTuple):
+def _c(real: str, name: str, arguments: Sequence[str], lines: Sequence[str], returned: Sequence[str]) -> str:
+    """A C99 function. It takes pointers to numbers, and another one, `out`, to where its results go, which are no
+    argument's.
+    """
+    takes = ", ".join(f"const {real} *{argument}" for argument in arguments)
+    body = [*lines, *(f"(void){argument};" for argument in arguments)]  # whether it is used or not
+    body += [f"out[{i}] = {value};" for i, value in enumerate(returned)]
+    return f"static void {name}({takes}, {real} *out)\n{{\n    " + "\n    ".join(body) + "\n}\n"
+
+
+@dataclass(frozen=True)
+class Language:
     """How a language writes what C and JavaScript write differently."""
 
-    function: Callable[[str], str]
+    mathematics: Callable[[str], str]
     """A function of mathematics, by its name in C for double precision."""
     number: Callable[[float], str]
     variable: str
     """The line that gives a variable {0} the value {1}."""
+    frame: Callable[[str, Sequence[str], Sequence[str], Sequence[str]], str]
+    """The function of a name, of arguments, lines and results."""
     network: str = ""
     """The line that gives an array {0} of {1} numbers what network {2} makes of the values {3}."""
 
+    def function(self, name: str, function: Callable[..., Any], arguments: Mapping[str, int]) -> str:
+        """The source of a function that computes what a Python function computes.
 
-_JAVASCRIPT = _Language(
+        Args:
+            name: of the function.
+            function: takes CasADi columns; returns a column, a number or a tuple of numbers.
+            arguments: the name and the size of each argument.
+
+        Raises:
+            ValueError: the function uses an operation that cannot be printed.
+        """
+        inputs = [casadi.SX.sym(argument, size) for argument, size in arguments.items()]
+        found = function(*inputs)
+        parts = found if isinstance(found, tuple) else (found,)
+        traced = casadi.Function(name, inputs, [casadi.densify(casadi.vertcat(*parts))], {"cse": True})
+        names, lines = list(arguments), []
+        values: dict[int, str] = {}  # what each place of the work vector holds now
+        returned = ["0"] * traced.size1_out(0)
+        for k in range(traced.n_instructions()):
+            operation, takes, gives = (
+                traced.instruction_id(k),
+                traced.instruction_input(k),
+                traced.instruction_output(k),
+            )
+            if operation == casadi.OP_OUTPUT:
+                returned[gives[1]] = values[takes[0]]
+            elif operation == casadi.OP_INPUT:
+                values[gives[0]] = f"{names[takes[0]]}[{takes[1]}]"
+            elif operation == casadi.OP_CONST:
+                values[gives[0]] = self.number(traced.instruction_constant(k))
+            elif operation == casadi.OP_CALL:
+                which, *given = (values[place] for place in takes)
+                lines.append(self.network.format(f"t{k}", len(gives), which[0], ", ".join(given)))
+                values |= {place: f"t{k}[{i}]" for i, place in enumerate(gives)}
+            elif operation not in _SHARED:
+                raise ValueError(f"{name}: the CasADi operation {operation} cannot be printed")
+            else:
+                form = re.sub(r"real_(\w+)", lambda found: self.mathematics(found[1]), _SHARED[operation])
+                value = form.replace("(real)", "").format(*(values[place] for place in takes))
+                lines.append(self.variable.format(f"t{k}", value))
+                values[gives[0]] = f"t{k}"
+        return self.frame(name, names, lines, returned)
+
+
+JAVASCRIPT = Language(
     lambda name: f"Math.{name.removeprefix('f') if name in ('fabs', 'fmin', 'fmax') else name}",
     _number,
     "const {0} = {1};",
+    _javascript,
     "const {0} = networks[{2}]([{3}]);",
 )
-_C = _Language(
+"""In double precision."""
+
+C = Language(
     lambda name: {"tanh": "squeezed"}.get(name, f"{name}f"),  # as exact, without branches
-    c_number,
+    _c_number,
     "const float {0} = {1};",
+    partial(_c, "float"),
     "const float {0}_in[] = {{{3}}}; float {0}[{1}]; networks[{2}]({0}_in, {0});",
 )
-_C_IN_DOUBLE = _Language(str, _number, "const double {0} = {1};")
+"""C99 in single precision."""
 
-
-def _printed(
-    name: str, function: Callable[..., Any], arguments: Mapping[str, int], language: _Language
-) -> tuple[list[str], list[str]]:
-    """The lines of a function, named for errors, and its results; for the arguments see `javascript_function`."""
-    inputs = [casadi.SX.sym(argument, size) for argument, size in arguments.items()]
-    found = function(*inputs)
-    parts = found if isinstance(found, tuple) else (found,)
-    traced = casadi.Function(name, inputs, [casadi.densify(casadi.vertcat(*parts))], {"cse": True})
-    names, lines = list(arguments), []
-    values: dict[int, str] = {}  # what each place of the work vector holds now
-    returned = ["0"] * traced.size1_out(0)
-    for k in range(traced.n_instructions()):
-        operation, takes, gives = traced.instruction_id(k), traced.instruction_input(k), traced.instruction_output(k)
-        if operation == casadi.OP_OUTPUT:
-            returned[gives[1]] = values[takes[0]]
-        elif operation == casadi.OP_INPUT:
-            values[gives[0]] = f"{names[takes[0]]}[{takes[1]}]"
-        elif operation == casadi.OP_CONST:
-            values[gives[0]] = language.number(traced.instruction_constant(k))
-        elif operation == casadi.OP_CALL:
-            which, *given = (values[place] for place in takes)
-            lines.append(language.network.format(f"t{k}", len(gives), which[0], ", ".join(given)))
-            values |= {place: f"t{k}[{i}]" for i, place in enumerate(gives)}
-        elif operation not in _SHARED:
-            raise ValueError(f"{name}: the CasADi operation {operation} cannot be printed")
-        else:
-            form = re.sub(r"real_(\w+)", lambda found: language.function(found[1]), _SHARED[operation])
-            value = form.replace("(real)", "").format(*(values[place] for place in takes))
-            lines.append(language.variable.format(f"t{k}", value))
-            values[gives[0]] = f"t{k}"
-    return lines, returned
+C_IN_DOUBLE = Language(str, _number, "const double {0} = {1};", partial(_c, "double"))
+"""C99 in double precision, without networks."""

@@ -34,9 +34,11 @@ _MARK = "ballbot_observation_digest"
 _DATA_LIMIT = 2**24  # bytes of JSON
 
 
-class _Saved(NamedTuple):
+class SavedModel(NamedTuple):
     """What is read of a model."""
 
+    path: Path
+    """Of its file."""
     layers: list[Any]
     """Weight and bias of each."""
     activation: str
@@ -54,6 +56,66 @@ class _Saved(NamedTuple):
         """Numbers of an observation."""
         return self.layers[0][0].shape[1]
 
+    @classmethod
+    def read(cls, path: str | Path) -> "SavedModel":
+        """What a file holds.
+
+        Raises:
+            PolicyError: the file is missing, damaged or of a kind that is not read.
+        """
+        try:
+            return _read_zip(Path(path))
+        except PolicyError:
+            raise
+        except Exception as error:  # torch has dozens of ways to refuse a damaged file
+            reason = str(error) if isinstance(error, files.FileError) else f"{error!r:.300}"
+            raise PolicyError(f"{path} cannot be read as a saved model: {reason}") from error
+
+    def _size(self, task: Task, params: Robot) -> int:
+        """Numbers that an env shows to the model, with the history that it was trained with."""
+        (size,) = observation_space(task, params, _history_of(self, task, params)).shape
+        return size
+
+    def fits(self, task: Task, params: Robot) -> bool:
+        """Whether it takes observations of a task's size, with or without earlier ones.
+
+        Raises:
+            PolicyError: the size is the task's and the spaces are not.
+        """
+        if self.observations != self._size(task, params):
+            return False
+        check_spaces(str(self.path), self, task, params)
+        return True
+
+    def actor(
+        self, task: Task, params: Robot, counterpart: tuple[spaces.Box, spaces.Box] | None = None
+    ) -> "_SavedActor":
+        """The deterministic policy: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
+
+        Args:
+            task: what it is to do.
+            params: the robot.
+            counterpart: spaces of observations and actions of the environment in which it was trained, if that is a
+                counterpart of the task.
+
+        Raises:
+            PolicyError: its observations or actions are not the env's.
+        """
+        size = counterpart[0].shape[0] if counterpart else self._size(task, params)
+        actions = len(self.layers[-1][1])
+        if (self.observations, actions) != (size, params.action_size):
+            raise PolicyError(
+                f"{self.path} takes {self.observations} observations and gives {actions} actions; {task.id} has {size} and "
+                f"{params.action_size}"
+            )
+        history = check_spaces(str(self.path), self, task, params, counterpart)
+        widths = (size, *(len(bias) for _, bias in self.layers))
+        network = linear_layers(widths, getattr(torch.nn, self.activation), device="cpu", dtype=torch.float32)
+        for linear, (weight, bias) in zip(list(network)[::2], self.layers, strict=True):
+            linear.load_state_dict({"weight": weight, "bias": bias})
+        unit = counterpart[1].high if counterpart else 1.0
+        return _SavedActor(network, self.squashed, history, unit, self.most).eval()
+
 
 class _SavedActor(torch.nn.Module):
     """Runs a network, and brings its output into [−1, 1]."""
@@ -62,7 +124,7 @@ class _SavedActor(torch.nn.Module):
         self, network: torch.nn.Module, squashed: bool, history: int = 0, unit: Any = 1.0, most: float = math.inf
     ):
         """Args: squashed: whether the output is, by tanh; else it is clipped. history: as that of its env. unit: the largest
-        action of its env. most: see `_Saved`.
+        action of its env. most: see `SavedModel`.
         """
         super().__init__()
         self._most = most
@@ -154,70 +216,7 @@ def _in_words(space: Any) -> str:
     return f"{space.shape} {space.dtype} from {space.low.min():g} to {space.high.max():g}"
 
 
-def fits(path: str | Path, task: Task, params: Robot) -> bool:
-    """Whether a saved model takes observations of a task's size, with or without earlier ones.
-
-    Raises:
-        PolicyError: as `load_actor`; also where the size is the task's and the spaces are not.
-    """
-    model = read(path)
-    if model.observations != _size(model, task, params):
-        return False
-    check_spaces(str(path), model, task, params)
-    return True
-
-
-def load_actor(
-    path: str | Path, task: Task, params: Robot, counterpart: tuple[spaces.Box, spaces.Box] | None = None
-) -> _SavedActor:
-    """The deterministic policy of a saved model: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
-
-    Args:
-        path: of the file.
-        task: what it is to do.
-        params: the robot.
-        counterpart: spaces of observations and actions of the environment in which it was trained, if that is a counterpart
-            of the task.
-
-    Raises:
-        PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
-            env's.
-    """
-    model = read(path)
-    size = counterpart[0].shape[0] if counterpart else _size(model, task, params)
-    actions = len(model.layers[-1][1])
-    if (model.observations, actions) != (size, params.action_size):
-        raise PolicyError(
-            f"{path} takes {model.observations} observations and gives {actions} actions; {task.id} has {size} and "
-            f"{params.action_size}"
-        )
-    history = check_spaces(str(path), model, task, params, counterpart)
-    widths = (size, *(len(bias) for _, bias in model.layers))
-    network = linear_layers(widths, getattr(torch.nn, model.activation), device="cpu", dtype=torch.float32)
-    for linear, (weight, bias) in zip(list(network)[::2], model.layers, strict=True):
-        linear.load_state_dict({"weight": weight, "bias": bias})
-    unit = counterpart[1].high if counterpart else 1.0
-    return _SavedActor(network, model.squashed, history, unit, model.most).eval()
-
-
-def _size(model: _Saved, task: Task, params: Robot) -> int:
-    """Numbers that an env shows to a model, with the history that the model was trained with."""
-    (size,) = observation_space(task, params, _history_of(model, task, params)).shape
-    return size
-
-
-def read(path: str | Path) -> _Saved:
-    """What a file holds; raises a PolicyError as `load_actor`."""
-    try:
-        return _read_zip(Path(path))
-    except PolicyError:
-        raise
-    except Exception as error:  # torch has dozens of ways to refuse a damaged file
-        reason = str(error) if isinstance(error, files.FileError) else f"{error!r:.300}"
-        raise PolicyError(f"{path} cannot be read as a saved model: {reason}") from error
-
-
-def _read_zip(path: Path) -> _Saved:
+def _read_zip(path: Path) -> SavedModel:
     members = files.unzipped(files.read(path), path)
     for name in ("data", "policy.pth"):
         if name not in members:
@@ -248,7 +247,7 @@ def _read_zip(path: Path) -> _Saved:
     found = (_space(data[name]) for name in ("observation_space", "action_space"))
     # where off-policy algorithms explore by the state, they bound the mean action, see SB3's `Actor`
     bound = float(options.get("clip_mean", 2.0)) if data.get("use_sde") and begins == _OFF_POLICY else 0.0
-    return _Saved(_layers(path, weights, *begins), activation, usual == "ReLU", bound or math.inf, *found)
+    return SavedModel(path, _layers(path, weights, *begins), activation, usual == "ReLU", bound or math.inf, *found)
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:

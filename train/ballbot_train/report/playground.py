@@ -25,8 +25,8 @@ from ballbot_gym.step import outcome
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.policy.files import BEST, PolicyError, PolicyFile, shipped_policies
-from ballbot_train.policy.network import PolicyNetwork, load_network
-from ballbot_train.policy.printed import javascript_function, layers_of, policy_function
+from ballbot_train.policy.network import PolicyNetwork
+from ballbot_train.policy.printed import JAVASCRIPT, policy_function
 from ballbot_train.report import labels
 from ballbot_train.report.page import asset
 
@@ -107,7 +107,7 @@ def playground_page(policies: Sequence[str] = (), live: bool = False) -> str:
 def engine_script(policies: Sequence[str] = ()) -> str:
     """All of the page that computes, as JavaScript without a page: what the tests run in node."""
     params, paths = default_params(), _policies(policies)
-    networks = {task: load_network(path, make_task(task)) for task, path in paths.items()}
+    networks = {task: PolicyNetwork.load(path, make_task(task)) for task, path in paths.items()}
     data = {
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
@@ -148,7 +148,7 @@ def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
         "label": labels.label(name),
         "color": labels.color(name),
         "activation": network.spec.activation,
-        **layers_of(network),
+        **network.layers(),
     }
 
 
@@ -194,8 +194,8 @@ def _model_script(params: Robot, networks: Mapping[str, PolicyNetwork]) -> str:
         return TRACKS["unknown"].robot(params, tuple(given.get(name, 1.0) for name in Randomization.DRAWN))
 
     parts = [
-        javascript_function("step", lambda x, u, r: robot(r).step(x, u, dt, substeps), {"x": 8, "u": 2, "robot": 3}),
-        javascript_function(
+        JAVASCRIPT.function("step", lambda x, u, r: robot(r).step(x, u, dt, substeps), {"x": 8, "u": 2, "robot": 3}),
+        JAVASCRIPT.function(
             "push", lambda x, impulse, r: robot(r).pushed(x, impulse), {"x": 8, "impulse": 2, "robot": 3}
         ),
     ]
@@ -207,7 +207,7 @@ def _model_script(params: Robot, networks: Mapping[str, PolicyNetwork]) -> str:
             "outcome": (partial(_outcome, task), {"x": 8, "u": 2, "end": 8, "c": len(task.constant_names)}),
             "action": (policy_function(network), {"o": network.spec.seen}),
         }
-        parts += [javascript_function(f"{name}_{key}", *function) for key, function in functions.items()]
+        parts += [JAVASCRIPT.function(f"{name}_{key}", *function) for key, function in functions.items()]
         entries = ", ".join(f"{key}: {name}_{key}" for key in functions)
         models.append(f"  {name}: {{ {entries}, limit_names: {json.dumps(task.limit_names)} }},")
     return "\n".join([*parts, "const MODELS = {", *models, "};"])
