@@ -33,7 +33,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.runner import Group, run_groups
+from ballbot_train.evaluation.runner import Group, MeasuredRun
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.work import jobs, shards
@@ -177,7 +177,7 @@ def certified_set(out: Path, workers: Workers, episodes: int) -> dict[str, np.nd
 
 def leaderboard(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
     groups = [Group("stabilize", "lqr", "rk4"), Group("turn", "lqr", "rk4")]
-    done = run_groups(groups, episodes // 2, out, workers, record=True)
+    done = MeasuredRun(out, workers).measure(groups, episodes // 2, record=True)
     return {
         name: np.array([getattr(row, name) for row in done])
         for name in ("cost", "optimum", "success", "failure", "settle_time")

@@ -75,7 +75,7 @@ def maps_of_lqr(bounds, monkeypatch, tmp_path):
     def maps(recovered):
         ran = []
 
-        def run_groups(groups, *_):
+        def measure(run, groups, *_):
             ran.extend(groups)
             for group in groups:
                 axis = group.labels["axis"]
@@ -83,8 +83,8 @@ def maps_of_lqr(bounds, monkeypatch, tmp_path):
                     state = (axis, x[basins.AXES[axis].component], round(math.degrees(x[2]), 9))
                     yield certified_result(controller="lqr", episode=k, success=state in recovered, labels=group.labels)
 
-        monkeypatch.setattr(basins.runner, "run_groups", run_groups)
-        return basins.run(["lqr"], POINTS, "rk4", tmp_path, 1), ran
+        monkeypatch.setattr(basins.MeasuredRun, "measure", measure)
+        return basins.Basins.run(["lqr"], POINTS, "rk4", tmp_path, 1), ran
 
     return maps
 
@@ -96,12 +96,13 @@ def test_only_states_that_may_be_recoverable_are_run_and_only_half_of_them(maps_
 
 
 def test_a_state_from_which_a_controller_recovers_is_recoverable(maps_of_lqr):
-    (basin, _), _ = maps_of_lqr({("speed", 0.0, 0.0), ("speed", 7.5, 37.5)})
+    found, _ = maps_of_lqr({("speed", 0.0, 0.0), ("speed", 7.5, 37.5)})
+    basin, _ = found.maps
     assert basin.recovered["lqr"].sum() == 3
     assert basin.recovered["lqr"][3, 3]
     assert basin.recovered["lqr"][1, 1]  # the same, turned by 180°
     assert basin.recoverable.sum() == 5 + 2
-    assert basins.fraction([basin], "lqr") == pytest.approx(3 / 7)
+    assert basin.fraction("lqr") == pytest.approx(3 / 7)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -109,20 +110,20 @@ def test_lqr_recovers_upright_and_slow_but_not_fast(robot, bounds, tmp_path, mon
     monkeypatch.setattr(basins, "AXES", {"speed": basins.AXES["speed"]})
     run, boundaries = basins.jobs.run, [[[{"boundary": bounds["speed"].tolist()}]]]
     monkeypatch.setattr(basins.jobs, "run", lambda *made: boundaries.pop() if boundaries else run(*made))
-    (basin,) = basins.run(["lqr"], 3, "rk4", tmp_path, 1, robot)
+    (basin,) = basins.Basins.run(["lqr"], 3, "rk4", tmp_path, 1, robot).maps
     assert basin.recovered["lqr"][:, 1].tolist() == [False, True, False]  # −15, 0 and 15 m/s
 
 
 def test_maps_are_written_and_drawn(maps_of_lqr, tmp_path):
-    maps, _ = maps_of_lqr({("speed", 0.0, 0.0), ("lean rate", 0.0, -37.5)})
-    basins.write(maps, {"commit": "none", "robot": "rolling"}, tmp_path)
+    found, _ = maps_of_lqr({("speed", 0.0, 0.0), ("lean rate", 0.0, -37.5)})
+    found.write({"commit": "none", "robot": "rolling"}, tmp_path)
     written = json.loads((tmp_path / "basins.json").read_text())
     assert written["rows"][0]["recovered"] == pytest.approx(3 / (5 + 7))
     assert [entry["recovered"] for entry in written["maps"]] == [
-        {"lqr": basin.recovered["lqr"].astype(int).tolist()} for basin in maps
+        {"lqr": basin.recovered["lqr"].astype(int).tolist()} for basin in found.maps
     ]
     assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
-    assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()
+    assert figures.save(figures.basin_figure(found), tmp_path / "basins.png").exists()
 
 
 def test_the_command_maps_what_is_recoverable(tmp_path, typed, monkeypatch):

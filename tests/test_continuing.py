@@ -21,7 +21,7 @@ from ballbot_gym.robot import (
 from ballbot_gym.tasks.identity import PARTS, changed_parts, problem_parts
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.demos import demos
-from ballbot_train.evaluation.runner import open_run
+from ballbot_train.evaluation.runner import MeasuredRun
 from ballbot_train.learning import apg, training
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS
@@ -98,7 +98,7 @@ def test_the_part_of_a_problem_that_changed_is_named(change: str, tmp_path: Path
 
 
 def claim_of_benchmark(out: Path) -> None:
-    open_run(out, 1, {"paper": {"stabilize": ["lqr"]}}, episodes=5)
+    MeasuredRun.open(out, 1, {"paper": {"stabilize": ["lqr"]}}, episodes=5)
     jobs.RunFolder(out).unfinished.mkdir(exist_ok=True)
     (jobs.RunFolder(out).unfinished / "job.json").write_text("[]")
 
@@ -150,9 +150,9 @@ def test_a_run_is_not_continued_after_its_urdf_was_edited(tmp_path: Path, monkey
         monkeypatch.setitem(ROBOTS, "mine", Registered(robot, {}))
         if mass == "14":
             with pytest.raises(ValueError, match="another problem stabilize: its robot has changed since"):
-                open_run(tmp_path / "run", 1, chosen, "mine", episodes=5)
+                MeasuredRun.open(tmp_path / "run", 1, chosen, "mine", episodes=5)
             break
-        open_run(tmp_path / "run", 1, chosen, "mine", episodes=5)
+        MeasuredRun.open(tmp_path / "run", 1, chosen, "mine", episodes=5)
         jobs.RunFolder(tmp_path / "run").unfinished.mkdir()
         (jobs.RunFolder(tmp_path / "run").unfinished / "job.json").write_text("[]")
         jobs.RunFolder(tmp_path / "run").unlock()
@@ -163,10 +163,10 @@ def test_a_run_is_not_continued_with_another_policy_in_the_same_file(part: str, 
     spec = PolicySpec.of(Stabilize(), hidden=(4,))
     path, out = PolicyNetwork(spec).save(tmp_path / "policy", {}), tmp_path / "out"
     chosen = {"paper": {"stabilize": [str(path)]}}
-    open_run(out, 1, chosen, episodes=5)
+    MeasuredRun.open(out, 1, chosen, episodes=5)
     jobs.RunFolder(out).unfinished.mkdir()
     (jobs.RunFolder(out).unfinished / "job.json").write_text("[]")
-    open_run(out, 1, chosen, episodes=5)
+    MeasuredRun.open(out, 1, chosen, episodes=5)
     if part == "weights":
         PolicyNetwork(spec).save(path, {})
     else:
@@ -174,7 +174,7 @@ def test_a_run_is_not_continued_with_another_policy_in_the_same_file(part: str, 
         document["spec"]["activation"] = "relu"
         path.write_text(json.dumps(document))
     with pytest.raises(ValueError, match=rf"the policy stabilize/.*policy\.json, whose {part} ha(s|ve) changed since"):
-        open_run(out, 1, chosen, episodes=5)
+        MeasuredRun.open(out, 1, chosen, episodes=5)
     jobs.RunFolder(out).unlock()
 
 

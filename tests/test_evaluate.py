@@ -76,7 +76,7 @@ def test_a_failure_is_not_near_the_goal_and_an_end_that_is_not_known_gives_no_sh
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path):
     def run():
-        return runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 7, tmp_path, 1, record=True)
+        return runner.MeasuredRun(tmp_path).measure([runner.Group("stabilize", "lqr", "rk4")], 7, record=True)
 
     first = run()
     path, last = sorted(tmp_path.rglob("unfinished/*.json"))
@@ -92,7 +92,7 @@ def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_p
 
 def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
     def rows(out, workers):
-        results = runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 7, out, workers, record=True)
+        results = runner.MeasuredRun(out, workers).measure([runner.Group("stabilize", "lqr", "rk4")], 7, record=True)
         return [replace(row, plan_ms_median=0, step_us_median=0) for row in leaderboard(results)]
 
     assert rows(tmp_path / "a", 1) == rows(tmp_path / "b", 2)
@@ -170,7 +170,7 @@ def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
     chosen = controllers.controllers_of(["stabilize", "turn"], ["lqr", path])
     assert chosen == {"paper": {"stabilize": ["lqr"], "turn": ["lqr", path]}}
     assert controllers.controllers_of(["stabilize", "turn"], [path]) == {"paper": {"turn": [path]}}
-    assert set(runner.open_run(tmp_path / "run", 1, chosen)["policies"]) == {f"turn/{path}"}
+    assert set(runner.MeasuredRun.open(tmp_path / "run", 1, chosen).facts["policies"]) == {f"turn/{path}"}
     with pytest.raises(ValueError, match="which is none of stabilize"):
         controllers.controllers_of(["stabilize"], [path])
 
@@ -211,7 +211,7 @@ def test_a_worker_needs_no_file_of_a_policy(tmp_path, monkeypatch):
 
     monkeypatch.setattr(runner.jobs, "run", run_elsewhere)
     groups = [runner.Group("turn", name, "rk4") for name in (str(folder / "mine.json"), "dagger")]
-    own, shipped = runner.run_groups(groups, 1, tmp_path, 1)
+    own, shipped = runner.MeasuredRun(tmp_path).measure(groups, 1)
     assert own.cost == shipped.cost
 
 

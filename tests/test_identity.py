@@ -14,7 +14,7 @@ from ballbot_gym.robot import ROBOTS, Registered
 from ballbot_gym.tasks.identity import observation_digest, problem_digest
 from ballbot_train import evaluate, load_policy, shipped_policies
 from ballbot_train.commands.export import export
-from ballbot_train.evaluation.runner import open_run
+from ballbot_train.evaluation.runner import MeasuredRun
 from ballbot_train.policy.files import PolicyError, PolicyFile, PolicySpec
 from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.work import jobs
@@ -148,14 +148,14 @@ def test_every_task_of_every_robot_is_a_problem_of_its_own(robot: str) -> None:
 
 def test_a_run_continues_with_the_same_problem_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = {"paper": {"stabilize": ["lqr"]}}
-    open_run(tmp_path, 1, chosen, episodes=5)
+    MeasuredRun.open(tmp_path, 1, chosen, episodes=5)
     unfinished = jobs.RunFolder(tmp_path).unfinished
     unfinished.mkdir(exist_ok=True)
     (unfinished / "job.json").write_text("[]")
-    open_run(tmp_path, 1, chosen, episodes=5)
+    MeasuredRun.open(tmp_path, 1, chosen, episodes=5)
     monkeypatch.setitem(TASKS, "stabilize", type(named_as_stabilize(Dearer)))
     with pytest.raises(ValueError, match="another problem stabilize: its costs have changed since"):
-        open_run(tmp_path, 1, chosen, episodes=5)
+        MeasuredRun.open(tmp_path, 1, chosen, episodes=5)
     jobs.RunFolder(tmp_path).unlock()
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from ballbot_gym.env import make_task
 from ballbot_train.commands.certify import certify
-from ballbot_train.evaluation.runner import Group, run_groups
+from ballbot_train.evaluation.runner import Group, MeasuredRun
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.work import jobs, shards
@@ -48,7 +48,8 @@ def certified_shards(out, workers):
 
 
 def results(out, workers):
-    done = run_groups([Group(task, "lqr", "rk4") for task in ("stabilize", "turn")], 12, out, workers, record=True)
+    groups = [Group(task, "lqr", "rk4") for task in ("stabilize", "turn")]
+    done = MeasuredRun(out, workers).measure(groups, 12, record=True)
     times = {"plan_seconds", "step_seconds"}
     return {
         f"{row.task}-{row.episode}": np.array([str(value) for name, value in vars(row).items() if name not in times])

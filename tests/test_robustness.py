@@ -24,12 +24,12 @@ def test_severity_0_is_no_disturbance_and_every_level_is_one(name):
 
 def run(stress, episodes, out, seed=0):
     groups = robustness.groups_of({"stabilize": ["lqr"]}, [stress], "rk4")
-    return runner.run_groups(groups, episodes, out, 1, seed)
+    return runner.MeasuredRun(out).measure(groups, episodes, seed)
 
 
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     results = run("delay", 3, tmp_path)
-    plain = runner.run_groups([runner.Group("stabilize", "lqr", "rk4")], 3, tmp_path / "plain", 1)
+    plain = runner.MeasuredRun(tmp_path / "plain").measure([runner.Group("stabilize", "lqr", "rk4")], 3)
     rows = leaderboard(results)
     assert [tuple(row.labels.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == leaderboard(plain)[0].cost_mean

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from ballbot_gym.robot import PAPER
 from ballbot_train.commands.options import Filter, WorkersOption
-from ballbot_train.evaluation import basins as maps
+from ballbot_train.evaluation.basins import TASK, Basins
 from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.names import with_way
-from ballbot_train.evaluation.runner import open_run
+from ballbot_train.evaluation.runner import MeasuredRun
 from ballbot_train.report import figures
 from ballbot_train.work import jobs
 from ballbot_train.work.console import Physics, RobotName, console, physics_or_default, print_table
@@ -36,19 +36,18 @@ def basins(
     """
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
-    chosen = controllers_of([maps.TASK], controllers, [robot], filter)
+    chosen = controllers_of([TASK], controllers, [robot], filter)
     physics = physics_or_default(physics, robot)
-    names = chosen[robot][maps.TASK]
-    facts = open_run(out, workers, chosen, robot, physics=physics, points=points)
-    ways = facts.get("trained_by", {})
-    made = maps.run(names, points, physics, out, workers, robot)
-    maps.write(made, facts, out)
-    picture = figures.save(figures.basin_figure(made, ways), out / "basins.png")
+    names = chosen[robot][TASK]
+    run = MeasuredRun.open(out, workers, chosen, robot, physics=physics, points=points)
+    found = Basins.run(names, points, physics, out, workers, robot)
+    found.write(run.facts, out)
+    picture = figures.save(figures.basin_figure(found, run.ways), out / "basins.png")
     jobs.RunFolder(out).release()
-    header = ["controller", "recovered", *(f"by lean and {basin.axis}" for basin in made)]
-    shares = [[maps.fraction(made, name), *(maps.fraction([basin], name) for basin in made)] for name in names]
+    header = ["controller", "recovered", *(f"by lean and {basin.axis}" for basin in found.maps)]
+    shares = [[found.fraction(name), *(basin.fraction(name) for basin in found.maps)] for name in names]
     rows = [
-        [with_way(name, ways.get(f"{maps.TASK}/{name}", "")), *(f"{share:.1%}" for share in group)]
+        [with_way(name, run.ways.get(f"{TASK}/{name}", "")), *(f"{share:.1%}" for share in group)]
         for name, group in zip(names, shares, strict=True)
     ]
     print_table(f"Share of the recoverable states, {points} × {points} a map, physics={physics}", header, rows)

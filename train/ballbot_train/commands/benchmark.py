@@ -11,7 +11,7 @@ from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness
 from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import TABLE, leaderboard, table_cells
-from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
+from ballbot_train.evaluation.runner import Group, MeasuredRun, checked_episodes
 from ballbot_train.report import figures
 from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Take, certified_replay, telling_episode
@@ -57,19 +57,19 @@ def benchmark(
         for track in randomization:
             Randomization.checked(track)
         settings["tracks"] = list(randomization)
-    facts = open_run(out, workers, made_for, robot, **settings)
+    run = MeasuredRun.open(out, workers, made_for, robot, **settings)
     if randomization:
         experts = {} if controllers else robustness.EXPERTS
         groups = robustness.groups_of(chosen, randomization, physics, robot, experts)
-        results = run_groups(groups, episodes, out, workers, seed)
+        results = run.measure(groups, episodes, seed)
         rows = robustness.track_rows(results, robot, seed)
         title = f"{episodes} certified episodes per task and track, physics={physics}"
-        publish(out, "tracks", title, robustness.TRACK_TABLE, rows, results, facts)
+        run.publish("tracks", title, robustness.TRACK_TABLE, rows, results)
         return
     groups = [Group(task, name, physics, robots[task]) for task, names in chosen.items() for name in names]
-    done = run_groups(groups, episodes, out, workers, seed, record=True)
-    rows, ways = leaderboard(done, seed), facts.get("trained_by", {})
-    regrets = figures.save(figures.regret_figure(done, ways), out / "figures" / "regret.png")
+    done = run.measure(groups, episodes, seed, record=True)
+    rows = leaderboard(done, seed)
+    regrets = figures.save(figures.regret_figure(done, run.ways), out / "figures" / "regret.png")
     replays, pictures = [], []
     for task, names in chosen.items():
         episode = telling_episode(task, done)
@@ -82,10 +82,10 @@ def benchmark(
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
     drawn = [each for each, name in zip(replays, chosen, strict=True) if isinstance(named_robot(robots[name]), Ballbot)]
-    report = report_page(title, drawn, [*TABLE], table_cells(TABLE, rows, ways), shown, facts)
+    report = report_page(title, drawn, [*TABLE], table_cells(TABLE, rows, run.ways), shown, run.facts)
     page = files.write(out / "report.html", report)
     title = f"{episodes} certified episodes per task, physics={physics}"
-    publish(out, "leaderboard", title, TABLE, rows, done, facts)
+    run.publish("leaderboard", title, TABLE, rows, done)
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")

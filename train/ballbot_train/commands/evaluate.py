@@ -15,7 +15,7 @@ from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation.controllers import ControllerName, controllers_of
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.evaluation.results import TABLE, leaderboard
-from ballbot_train.evaluation.runner import Group, checked_episodes, open_run, publish, run_groups
+from ballbot_train.evaluation.runner import Group, MeasuredRun, checked_episodes
 from ballbot_train.work import jobs
 from ballbot_train.work.console import (
     Physics,
@@ -92,12 +92,12 @@ def evaluate(
     engine, count = physics_or_default(physics, robot), checked_episodes(episodes)
     settings = {"physics": engine, "episodes": count, "seed": seed}
     settings |= {"tracks": [randomization]} if randomization else {}
-    facts = open_run(out, workers, chosen, robot, **settings)
+    run = MeasuredRun.open(out, workers, chosen, robot, **settings)
     group = Group(task, policy, engine, robot, randomization=varied, own_optima=True)
-    results = run_groups([group], count, out, workers, seed, record=not varied.active)
+    results = run.measure([group], count, seed, record=not varied.active)
     rows = leaderboard(results, seed)
     title = f"{count} certified episodes of {task}, physics={engine}"
-    publish(out, "leaderboard", title, TABLE, rows, results, facts)
+    run.publish("leaderboard", title, TABLE, rows, results)
     console.print(f"all episodes: {out / 'episodes.csv'}")
 
 

@@ -9,7 +9,7 @@ from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import Row, leaderboard, shown
-from ballbot_train.evaluation.runner import checked_episodes, open_run, publish, run_groups
+from ballbot_train.evaluation.runner import MeasuredRun, checked_episodes
 from ballbot_train.report import figures
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
 from ballbot_train.work.executors import Workers
@@ -47,12 +47,12 @@ def robustness(
     physics = physics_or_default(physics, robot)
     check_names("stress", stresses, stressed.STRESSES, least=1)
     settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
-    facts = open_run(out, workers, {robot: chosen}, robot, **settings)
-    results = run_groups(stressed.groups_of(chosen, stresses, physics, robot), episodes, out, workers, seed)
+    run = MeasuredRun.open(out, workers, {robot: chosen}, robot, **settings)
+    results = run.measure(stressed.groups_of(chosen, stresses, physics, robot), episodes, seed)
     rows = leaderboard(results, seed)
     for task in chosen:
         figures.save(
-            figures.robustness_figure(rows, task, facts.get("trained_by", {})),
+            figures.robustness_figure(rows, task, run.ways),
             out / "figures" / f"robustness-{task}.png",
         )
     curves = [
@@ -63,7 +63,7 @@ def robustness(
     ]
     title = f"{episodes} certified episodes per task and severity, physics={physics}"
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
-    publish(out, "robustness", title, _TABLE, rows, results, facts, curves, stresses=labels)
+    run.publish("robustness", title, _TABLE, rows, results, curves, stresses=labels)
     console.print(f"curves: {out / 'figures'}")
 
 

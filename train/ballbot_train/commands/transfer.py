@@ -12,7 +12,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation.controllers import controllers_of
 from ballbot_train.evaluation.results import Row, leaderboard, shown
-from ballbot_train.evaluation.runner import Group, checked_episodes, floor, open_run, publish, run_groups
+from ballbot_train.evaluation.runner import Group, MeasuredRun, checked_episodes, floor
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
 from ballbot_train.work.executors import Workers
 
@@ -71,7 +71,7 @@ def transfer(
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
     engines, episodes = [physics_or_default(one, robot) for one in physics or (None,)], checked_episodes(episodes)
     settings = {"frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
-    facts = open_run(out, workers, chosen, robot, **settings)
+    run = MeasuredRun.open(out, workers, chosen, robot, **settings)
     groups = [
         Group(
             task,
@@ -88,8 +88,8 @@ def transfer(
         for friction in frictions or (None,)
         for engine in engines
     ]
-    results = run_groups(groups, episodes, out, workers, seed)
+    results = run.measure(groups, episodes, seed)
     rows = leaderboard(results, seed)
     title = f"{episodes} certified episodes of {robot} per task"
-    publish(out, "transfer", title, _TABLE, rows, results, facts, renamed=_IN_CSV, regret=_REGRET)
+    run.publish("transfer", title, _TABLE, rows, results, renamed=_IN_CSV, regret=_REGRET)
     console.print(f"matrix: {out / 'transfer.csv'}")

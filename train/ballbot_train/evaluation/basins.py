@@ -17,8 +17,8 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, named_robot
-from ballbot_train.evaluation import runner
 from ballbot_train.evaluation.results import Result
+from ballbot_train.evaluation.runner import Group, MeasuredRun
 from ballbot_train.work import jobs
 from ballbot_train.work.executors import Workers
 
@@ -55,26 +55,79 @@ class BasinMap:
     recovered: dict[str, np.ndarray]
     """By controller."""
 
+    def fraction(self, controller: str) -> float:
+        """The share of the recoverable states that a controller brings to rest."""
+        return float(self.recovered[controller].sum() / self.recoverable.sum())
 
-def run(
-    controllers: Sequence[str], points: int, physics: str, out: Path, workers: int | Workers, robot: str = PAPER
-) -> list[BasinMap]:
-    """Finds the boundaries, runs the controllers from every state within them, resumably, and makes a map for each axis.
 
-    Args:
-        controllers: names.
-        points: along each axis of a map; odd.
-        physics: "bullet", "mujoco" or "rk4".
-        out: folder of the results.
-        workers: a number of processes, or `Workers`.
-        robot: by name.
-    """
-    search = [jobs.Job(f"boundary-{name}", _boundary, (robot,), (name,), "boundary") for name in AXES]
-    found = jobs.run(search, out, workers)
-    bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
-    cells = _cells_of(bounds, points)
-    results = runner.run_groups(_groups_of(cells, controllers, points, physics, robot), 0, out, workers)
-    return _maps_of(bounds, cells, results, controllers, points)
+@dataclass(frozen=True)
+class Basins:
+    """A map for each of `AXES`, of the same controllers."""
+
+    maps: tuple[BasinMap, ...]
+
+    @classmethod
+    def run(
+        cls,
+        controllers: Sequence[str],
+        points: int,
+        physics: str,
+        out: Path,
+        workers: int | Workers,
+        robot: str = PAPER,
+    ) -> "Basins":
+        """Finds the boundaries, runs the controllers from every state within them, resumably, and makes a map for each axis.
+
+        Args:
+            controllers: names.
+            points: along each axis of a map; odd.
+            physics: "bullet", "mujoco" or "rk4".
+            out: folder of the results.
+            workers: a number of processes, or `Workers`.
+            robot: by name.
+        """
+        search = [jobs.Job(f"boundary-{name}", _boundary, (robot,), (name,), "boundary") for name in AXES]
+        found = jobs.run(search, out, workers)
+        bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
+        cells = _cells_of(bounds, points)
+        groups = _groups_of(cells, controllers, points, physics, robot)
+        results = MeasuredRun(out, workers).measure(groups, 0)
+        return cls(tuple(_maps_of(bounds, cells, results, controllers, points)))
+
+    def fraction(self, controller: str) -> float:
+        """The share of the recoverable states of all maps that a controller brings to rest."""
+        recovered = sum(int(np.sum(basin.recovered[controller])) for basin in self.maps)
+        return recovered / sum(int(np.sum(basin.recoverable)) for basin in self.maps)
+
+    def write(self, facts: Mapping[str, Any], out: Path) -> None:
+        """Writes basins.json, which holds the facts as "about", rows and maps, and basins.csv with a line for each state."""
+        rows = [
+            {"task": TASK, "controller": c, "recovered": self.fraction(c)}
+            | {basin.axis: basin.fraction(c) for basin in self.maps}
+            for c in self.maps[0].recovered
+        ]
+        document = {
+            "about": facts,
+            "rows": rows,
+            "maps": [vars(basin) | {"label": AXES[basin.axis].label} for basin in self.maps],
+        }
+        text = json.dumps(
+            document, ensure_ascii=False, default=lambda array: (0 + array).tolist()
+        )  # truth values as 0 and 1
+        files.write(out / "basins.json", text + "\n")
+        lines = [
+            {
+                "axis": basin.axis,
+                "value": f"{value:g}",
+                "lean_deg": f"{lean:g}",
+                "recoverable": int(basin.recoverable[i, j]),
+                **{name: int(cells[i, j]) for name, cells in basin.recovered.items()},
+            }
+            for basin in self.maps
+            for i, value in enumerate(basin.values)
+            for j, lean in enumerate(basin.leans)
+        ]
+        files.write_csv(out / "basins.csv", lines)
 
 
 def _boundary(robot: str, names: Sequence[str]) -> Iterator[jobs.Entry]:
@@ -113,15 +166,15 @@ def _cells_of(bounds: Mapping[str, np.ndarray], points: int) -> dict[str, np.nda
 
 def _groups_of(
     cells: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str, robot: str = PAPER
-) -> list[runner.Group]:
-    """What to run, for `run_groups`: every controller from all states of each map. Results are labelled with their "axis"."""
+) -> list[Group]:
+    """What to run: every controller from all states of each map. Results are labelled with their "axis"."""
     groups = []
     for name, chosen in cells.items():
         leans, values = _grid(name, points)
         starts = np.zeros((len(chosen), named_robot(robot).state_size))
         starts[:, AXES[name].component], starts[:, 2] = values[chosen[:, 0]], np.radians(leans[chosen[:, 1]])
         world: dict[str, Any] = {"starts": starts, "fields": {"arena_radius": _ARENA_RADIUS}, "labels": {"axis": name}}
-        groups += [runner.Group(TASK, each, physics, robot, counts_for=each, **world) for each in controllers]
+        groups += [Group(TASK, each, physics, robot, counts_for=each, **world) for each in controllers]
     return groups
 
 
@@ -145,40 +198,3 @@ def _maps_of(
         recoverable = np.logical_or.reduce([_within(boundary, leans, values), *recovered[name].values()])
         maps.append(BasinMap(name, leans, values, boundary, recoverable, recovered[name]))
     return maps
-
-
-def fraction(maps: Sequence[BasinMap], controller: str) -> float:
-    """The share of the recoverable states of maps that a controller brings to rest."""
-    recovered = sum(int(np.sum(basin.recovered[controller])) for basin in maps)
-    return recovered / sum(int(np.sum(basin.recoverable)) for basin in maps)
-
-
-def write(maps: Sequence[BasinMap], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes basins.json, which holds the facts as "about", rows and maps, and basins.csv with a line for each state."""
-    rows = [
-        {"task": TASK, "controller": c, "recovered": fraction(maps, c)}
-        | {basin.axis: fraction([basin], c) for basin in maps}
-        for c in maps[0].recovered
-    ]
-    document = {
-        "about": facts,
-        "rows": rows,
-        "maps": [vars(basin) | {"label": AXES[basin.axis].label} for basin in maps],
-    }
-    text = json.dumps(
-        document, ensure_ascii=False, default=lambda array: (0 + array).tolist()
-    )  # truth values as 0 and 1
-    files.write(out / "basins.json", text + "\n")
-    lines = [
-        {
-            "axis": basin.axis,
-            "value": f"{value:g}",
-            "lean_deg": f"{lean:g}",
-            "recoverable": int(basin.recoverable[i, j]),
-            **{name: int(cells[i, j]) for name, cells in basin.recovered.items()},
-        }
-        for basin in maps
-        for i, value in enumerate(basin.values)
-        for j, lean in enumerate(basin.leans)
-    ]
-    files.write_csv(out / "basins.csv", lines)

@@ -302,7 +302,7 @@ def table_cells(
 ) -> list[list[str]]:
     """Rows as text, one cell for each entry of `shown`. Paths of policies are as short as possible while they differ.
 
-    `ways` are the whole ways of shipped policies by "TASK/NAME", see `open_run`.
+    `ways` are the whole ways of shipped policies by "TASK/NAME", see `MeasuredRun`.
     """
     table = [[text(row) for text in shown.values()] for row in rows]
     if "controller" in shown:

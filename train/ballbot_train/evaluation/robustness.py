@@ -105,7 +105,7 @@ def groups_of(
     robot: str = PAPER,
     experts: Mapping[str, Sequence[str]] = {},
 ) -> list[Group]:
-    """What to run, for `run_groups`. Results are labelled with "stress" and "level". Tracks have level 0.
+    """What to run, for `MeasuredRun.measure`. Results are labelled with "stress" and "level". Tracks have level 0.
 
     Args:
         controllers: names by task. Policies that were trained on a track meet that track alone.

@@ -1,6 +1,6 @@
 """Runs controllers on the certified episodes of a task, or from given states, with any robot and engine.
 
-`run_episodes` runs one controller in one environment. `run_groups` runs many in parallel processes, resumably. Everything
+`run_episodes` runs one controller in one environment. `MeasuredRun` runs many in parallel processes, resumably. Everything
 that measures episodes one by one does so through these: `evaluate`, and the commands benchmark, evaluate, robustness,
 transfer and basins.
 """
@@ -37,97 +37,6 @@ _TABLES = ("leaderboard", "tracks", "robustness", "transfer", "basins")
 """What runs write as NAME.json when they end."""
 CHUNK = 5
 """Episodes of a job."""
-
-
-def open_run(
-    out: Path,
-    workers: int | Workers,
-    chosen: Mapping[str, Mapping[str, Sequence[str]]],
-    robot: str = PAPER,
-    **settings: Any,
-) -> dict[str, Any]:
-    """Claims a folder for a run with some settings; `publish` or `RunFolder.release` ends the run.
-
-    Args:
-        out: the folder.
-        workers: a number of processes, or `Workers`; they change no result.
-        chosen: the controllers that are run by task, by the robot that they were made for, as `controllers_of` gives.
-        robot: on which they run, by name.
-        settings: whatever else decides the results.
-
-    Returns:
-        The facts that the results name.
-
-    Raises:
-        ValueError: the folder holds results, or an unfinished run, with other settings, problems, policies or code; another
-            process is using it; or the seed is negative.
-    """
-    check_least(0, seed=settings.get("seed", 0))
-    digests = PolicyFile.weights_digest, PolicyFile.network_digest
-    policies, networks = (_digests(chosen, robot, of) for of in digests)
-    problems = {
-        task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
-        for made_for, by_task in chosen.items()
-        for task in by_task
-        for name in (robot, made_for)
-    }
-    settings |= robot_setting(robot) | {"policies": policies, "networks": networks, "problems": problems}
-    settings["controllers"] = chosen
-    for path in (out / f"{name}.json" for name in _TABLES):
-        if path.exists():
-            about = files.read_json(path).get("about")
-            held = {key: value for key, value in about.items() if key in settings} if isinstance(about, dict) else {}
-            jobs.check_same(held, settings, out, "results")
-    facts = {"benchmark": version.BENCHMARK} | provenance() | settings
-    facts["workers"] = Workers.of(workers).here or "a Ray cluster"
-    ways = {name: shipped_ways()[found] for name, found in policies.items() if found in shipped_ways()}
-    facts |= {"trained_by": ways} if ways else {}
-    jobs.RunFolder(out).claim({key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
-    return facts
-
-
-def _digests(
-    chosen: Mapping[str, Mapping[str, Sequence[str]]], robot: str, of: Callable[[PolicyFile], str]
-) -> dict[str, str]:
-    """A digest of every learned policy under "TASK/NAME", or "ROBOT/TASK/NAME" of policies made for another robot."""
-    return {
-        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(file)
-        for made_for, by_task in chosen.items()
-        for task, group in by_task.items()
-        for name in group
-        if (file := ControllerName(name).file(make_task(task, made_for), made_for)) is not None
-    }
-
-
-def publish(
-    out: Path,
-    name: str,
-    title: str,
-    shown: Mapping[str, Callable[[Any], str]],
-    rows: Sequence[Row],
-    results: Sequence[Result],
-    facts: Mapping[str, Any],
-    lines: Sequence[Any] | None = None,
-    **more: Any,
-) -> None:
-    """Ends a run: writes its results, and its table as NAME.md, which it prints too.
-
-    Args:
-        out: the folder of the run.
-        name: of the files.
-        title: of the table.
-        shown: what the table shows of each line, by header.
-        rows: see `write_results`, as the results of all episodes and more.
-        results: of every episode.
-        facts: of `open_run`. Shipped policies are called by the whole way of their training.
-        lines: of the table; default, the rows.
-        more: what else the files hold.
-    """
-    write_results(rows, results, facts, out, name, **more)
-    header, table = list(shown), table_cells(shown, rows if lines is None else lines, facts.get("trained_by", {}))
-    files.write(out / f"{name}.md", markdown(header, table))
-    jobs.RunFolder(out).release()
-    print_table(title, header, table)
 
 
 def floor(robot: str, friction: float | None) -> Robot:
@@ -182,45 +91,143 @@ class Group:
         return make_task(self.task, made_for, **self.fields), named_robot(made_for)
 
 
-def run_groups(
-    groups: Sequence[Group],
-    episodes: int,
-    out: Path,
-    workers: int | Workers,
-    seed: int = 0,
-    record: bool = False,
-) -> list[Result]:
-    """Runs groups in parallel processes, with progress bars. What an interrupted run finished is not run again.
+@dataclass(frozen=True)
+class MeasuredRun:
+    """A run that measures controllers on many episodes, in parallel and resumably, and whose results go into one folder."""
 
-    Optima that the package does not have are computed.
+    out: Path
+    """The folder."""
+    workers: int | Workers = 1
+    """A number of processes, or `Workers`; they change no result."""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """What the results name; of a run that is opened."""
 
-    Args:
-        groups: what to run.
-        episodes: of each group, from the first; of a group with starts all are run.
-        out: folder of the results.
-        workers: a number of processes, or `Workers`.
-        seed: of whatever is drawn: episode i draws the same in every group.
-        record: whether to write what the controllers do, for `ballbot submit`.
-    """
-    # the optima go along, because workers on other machines do not have this user's cache
-    known = {
-        (task, robot, varied): replace(
-            optima.known(task, robot, range(episodes), workers, varied), trajectories=(), statuses=np.zeros(0, str)
-        )
-        for task, robot, varied in dict.fromkeys(group.problem for group in groups if group.starts is None)
+    @classmethod
+    def open(
+        cls,
+        out: Path,
+        workers: int | Workers,
+        chosen: Mapping[str, Mapping[str, Sequence[str]]],
+        robot: str = PAPER,
+        **settings: Any,
+    ) -> "MeasuredRun":
+        """Claims a folder for a run with some settings; `publish` or `RunFolder.release` ends the run.
+
+        Args:
+            out: the folder.
+            workers: a number of processes, or `Workers`; they change no result.
+            chosen: the controllers that are run by task, by the robot that they were made for, as `controllers_of` gives.
+            robot: on which they run, by name.
+            settings: whatever else decides the results.
+
+        Raises:
+            ValueError: the folder holds results, or an unfinished run, with other settings, problems, policies or code;
+                another process is using it; or the seed is negative.
+        """
+        check_least(0, seed=settings.get("seed", 0))
+        digests = PolicyFile.weights_digest, PolicyFile.network_digest
+        policies, networks = (_digests(chosen, robot, of) for of in digests)
+        problems = {
+            task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
+            for made_for, by_task in chosen.items()
+            for task in by_task
+            for name in (robot, made_for)
+        }
+        settings |= robot_setting(robot) | {"policies": policies, "networks": networks, "problems": problems}
+        settings["controllers"] = chosen
+        for path in (out / f"{name}.json" for name in _TABLES):
+            if path.exists():
+                about = files.read_json(path).get("about")
+                held = (
+                    {key: value for key, value in about.items() if key in settings} if isinstance(about, dict) else {}
+                )
+                jobs.check_same(held, settings, out, "results")
+        facts = {"benchmark": version.BENCHMARK} | provenance() | settings
+        facts["workers"] = Workers.of(workers).here or "a Ray cluster"
+        ways = {name: shipped_ways()[found] for name, found in policies.items() if found in shipped_ways()}
+        facts |= {"trained_by": ways} if ways else {}
+        jobs.RunFolder(out).claim({key: facts[key] for key in ("benchmark", "version", "commit", *settings)})
+        return cls(out, workers, facts)
+
+    @property
+    def ways(self) -> Mapping[str, str]:
+        """The whole ways of the training of shipped policies, by "TASK/NAME"."""
+        return self.facts.get("trained_by", {})
+
+    def measure(self, groups: Sequence[Group], episodes: int, seed: int = 0, record: bool = False) -> list[Result]:
+        """Runs groups in parallel processes, with progress bars. What an interrupted run finished is not run again.
+
+        Optima that the package does not have are computed.
+
+        Args:
+            groups: what to run.
+            episodes: of each group, from the first; of a group with starts all are run.
+            seed: of whatever is drawn: episode i draws the same in every group.
+            record: whether to write what the controllers do, for `ballbot submit`.
+        """
+        # the optima go along, because workers on other machines do not have this user's cache
+        known = {
+            (task, robot, varied): replace(
+                optima.known(task, robot, range(episodes), self.workers, varied),
+                trajectories=(),
+                statuses=np.zeros(0, str),
+            )
+            for task, robot, varied in dict.fromkeys(group.problem for group in groups if group.starts is None)
+        }
+        work = [list(_jobs_of(group, episodes, seed, known, record)) for group in groups]
+        done, results = iter(jobs.run([job for some in work for job in some], self.out, self.workers)), []
+        for group, some in zip(groups, work, strict=True):
+            entries = [entry for _ in some for entry in next(done)]
+            if record:
+                motions = [Recording.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
+                task, params = make_task(group.task, group.robot), named_robot(group.robot)
+                policy = ControllerName(group.controller).file(task, group.robot)
+                who = group.physics, group.controller, "" if policy is None else policy.weights_digest()
+                Recording.of_run(motions, task, group.task, params, *who).write_in(self.out)
+            results += [Result(**{**entry, "labels": group.labels}) for entry in entries]
+        return results
+
+    def publish(
+        self,
+        name: str,
+        title: str,
+        shown: Mapping[str, Callable[[Any], str]],
+        rows: Sequence[Row],
+        results: Sequence[Result],
+        lines: Sequence[Any] | None = None,
+        **more: Any,
+    ) -> None:
+        """Ends a run: writes its results, and its table as NAME.md, which it prints too.
+
+        The table calls shipped policies by the whole way of their training.
+
+        Args:
+            name: of the files.
+            title: of the table.
+            shown: what the table shows of each line, by header.
+            rows: see `write_results`, as the results of all episodes and more.
+            results: of every episode.
+            lines: of the table; default, the rows.
+            more: what else the files hold.
+        """
+        write_results(rows, results, self.facts, self.out, name, **more)
+        header, table = list(shown), table_cells(shown, rows if lines is None else lines, self.ways)
+        files.write(self.out / f"{name}.md", markdown(header, table))
+        jobs.RunFolder(self.out).release()
+        print_table(title, header, table)
+
+
+def _digests(
+    chosen: Mapping[str, Mapping[str, Sequence[str]]], robot: str, of: Callable[[PolicyFile], str]
+) -> dict[str, str]:
+    """A digest of every learned policy under "TASK/NAME", or "ROBOT/TASK/NAME" of policies made for another robot."""
+    return {
+        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(file)
+        for made_for, by_task in chosen.items()
+        for task, group in by_task.items()
+        for name in group
+        if (file := ControllerName(name).file(make_task(task, made_for), made_for)) is not None
     }
-    work = [list(_jobs_of(group, episodes, seed, known, record)) for group in groups]
-    done, results = iter(jobs.run([job for some in work for job in some], out, workers)), []
-    for group, some in zip(groups, work, strict=True):
-        entries = [entry for _ in some for entry in next(done)]
-        if record:
-            motions = [Recording.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
-            task, params = make_task(group.task, group.robot), named_robot(group.robot)
-            policy = ControllerName(group.controller).file(task, group.robot)
-            who = group.physics, group.controller, "" if policy is None else policy.weights_digest()
-            Recording.of_run(motions, task, group.task, params, *who).write_in(out)
-        results += [Result(**{**entry, "labels": group.labels}) for entry in entries]
-    return results
 
 
 def _without_optima(states: np.ndarray) -> certified.EvaluationSet:

@@ -17,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 from ballbot_gym import files
 from ballbot_gym.robot import Ballbot, Robot
 from ballbot_gym.tasks.marker import Marker
-from ballbot_train.evaluation.basins import AXES, TASK, BasinMap, fraction
+from ballbot_train.evaluation.basins import AXES, TASK, Basins
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
 from ballbot_train.report.labels import ORDER, color, labels
@@ -166,8 +166,9 @@ def robustness_figure(rows: Sequence[Row], task: str, ways: Mapping[str, str] = 
     return figure
 
 
-def basin_figure(maps: Sequence[BasinMap], ways: Mapping[str, str] = {}) -> Figure:
+def basin_figure(basins: Basins, ways: Mapping[str, str] = {}) -> Figure:
     """The initial states that each controller brings to rest, coloured, on those that the robot's limits allow, grey."""
+    maps = basins.maps
     controllers, named = list(maps[0].recovered), labels(maps[0].recovered, TASK, ways)
     size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
     figure = Figure(figsize=size, layout="constrained")
@@ -181,7 +182,7 @@ def basin_figure(maps: Sequence[BasinMap], ways: Mapping[str, str] = {}) -> Figu
                 basin.leans, basin.values, cells, cmap=colors, vmin=0, vmax=2, shading="nearest", alpha=0.85
             )
             axis.fill(*basin.boundary.T, fill=False, ec="k", lw=1.6)
-            axis.set_title(f"{named[controller]}: {fraction([basin], controller):.0%}", fontsize=10)
+            axis.set_title(f"{named[controller]}: {basin.fraction(controller):.0%}", fontsize=10)
             axis.axhline(0, color="0.5", lw=0.5)
             axis.axvline(0, color="0.5", lw=0.5)
             axis.set_xlim(-81, 81)
