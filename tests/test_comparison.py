@@ -6,7 +6,7 @@ import pytest
 from builders import result
 
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.statistics import interval, share_interval
+from ballbot_train.evaluation.statistics import Interval
 
 EXPERT, POLICY = "lqr", "shac"
 
@@ -39,7 +39,7 @@ def regrets(rng):
 def test_the_interval_covers_the_true_mean_as_often_as_it_says(rng):
     covered = 0
     for _ in range(100):
-        low, high = interval(rng.exponential(size=50))
+        low, high = Interval.of_mean(rng.exponential(size=50))
         covered += low <= 1.0 <= high
     assert covered >= 86  # 95 % less three standard deviations, and what skewed data cost
 
@@ -50,17 +50,17 @@ def test_the_intervals_are_those_of_scipy(rng, draw):
     values = getattr(rng, draw)(size=60)
     options = {"confidence_level": 0.95, "n_resamples": 9999, "method": "BCa", "rng": np.random.default_rng(0)}
     expected = stats.bootstrap((values,), np.mean, **options).confidence_interval
-    assert interval(values) == pytest.approx((expected.low, expected.high), rel=1e-12)
+    assert Interval.of_mean(values) == pytest.approx((expected.low, expected.high), rel=1e-12)
     for count, total in ((0, 10), (3, 10), (10, 10), (9987, 10000)):
         wilson = stats.binomtest(count, total).proportion_ci(0.95, method="wilson")
-        assert share_interval(count, total) == pytest.approx((wilson.low, wilson.high), rel=1e-12)
+        assert Interval.of_share(count, total) == pytest.approx((wilson.low, wilson.high), rel=1e-12)
 
 
 def test_the_interval_of_degenerate_data_exists_or_is_nan_without_a_warning(recwarn):
-    assert interval([0.3] * 10) == (0.3, 0.3)
-    assert all(math.isnan(end) for end in interval([0.3]))
-    assert all(math.isnan(end) for end in interval([]))
-    low, high = interval([0.0] * 199 + [1.0])
+    assert Interval.of_mean([0.3] * 10) == (0.3, 0.3)
+    assert all(math.isnan(end) for end in Interval.of_mean([0.3]))
+    assert all(math.isnan(end) for end in Interval.of_mean([]))
+    low, high = Interval.of_mean([0.0] * 199 + [1.0])
     assert 0 <= low <= high < 0.1
     assert len(recwarn) == 0
 

@@ -21,7 +21,7 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train import evaluate_fresh
 from ballbot_train.commands.evaluate import evaluate
 from ballbot_train.evaluation import fresh
-from ballbot_train.evaluation.statistics import share_interval
+from ballbot_train.evaluation.statistics import Interval
 from ballbot_train.learning import training
 from ballbot_train.policy.files import shipped_policies
 from ballbot_train.policy.network import load_policy
@@ -140,7 +140,7 @@ def test_the_worst_episodes_are_those_without_success_and_then_the_dearest(turns
 
 
 def test_wilson_s_interval_is_not_empty_where_nothing_failed():
-    low, high = share_interval(0, 10_000)
+    low, high = Interval.of_share(0, 10_000)
     assert low == pytest.approx(0, abs=1e-12)
     assert high == pytest.approx(1.96**2 / (10_000 + 1.96**2), rel=1e-3)
 

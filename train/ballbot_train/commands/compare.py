@@ -6,7 +6,8 @@ from typing import Any
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.robot import PAPER
 from ballbot_train.evaluation import comparison, submissions
-from ballbot_train.evaluation.results import Result, read_results, with_interval
+from ballbot_train.evaluation.results import Result, read_results
+from ballbot_train.evaluation.statistics import Interval
 from ballbot_train.work.console import console, print_table
 
 
@@ -55,6 +56,6 @@ def _read(source: Path) -> tuple[dict[str, Any], list[Result]]:
 
 
 def _cells(entry: comparison.Comparison) -> list[str]:
-    success = with_interval(entry.success, entry.success_low, entry.success_high, "+")
-    regret = with_interval(entry.regret, entry.regret_low, entry.regret_high, "+")
+    success = Interval(entry.success_low, entry.success_high).text(entry.success, "+")
+    regret = Interval(entry.regret_low, entry.regret_high).text(entry.regret, "+")
     return [entry.task, entry.controller, entry.verdict, str(entry.episodes), success, regret, entry.why]

@@ -11,8 +11,9 @@ from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import Filter, WorkersOption
 from ballbot_train.evaluation.controllers import controllers_of
-from ballbot_train.evaluation.results import Row, leaderboard, shown
+from ballbot_train.evaluation.results import Row, leaderboard
 from ballbot_train.evaluation.runner import Group, MeasuredRun, checked_episodes, floor
+from ballbot_train.evaluation.statistics import shown
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default
 from ballbot_train.work.executors import Workers
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_train.evaluation.results import Result
-from ballbot_train.evaluation.statistics import CONFIDENCE, interval
+from ballbot_train.evaluation.statistics import CONFIDENCE, Interval
 
 MARGIN = 0.001
 """Of regret and of success: PyBullet and the model of the optimum differ by as much."""
@@ -140,8 +140,8 @@ def _compare_one(task: str, name: str, a: Mapping[int, Result], b: Mapping[int, 
     else:
         wins = np.array([float(second.success) - float(first.success) for first, second in pairs])
         regrets = np.array([s.regret - f.regret for f, s in pairs if not (f.failure or s.failure)])
-        success = float(wins.mean()), interval(wins)
-        regret = (float(regrets.mean()), interval(regrets)) if len(regrets) else nothing
+        success = float(wins.mean()), Interval.of_mean(wins)
+        regret = (float(regrets.mean()), Interval.of_mean(regrets)) if len(regrets) else nothing
         outcome, why = _judge(wins, success[1], regret[1], len(regrets), margin)
     return Comparison(task, name, len(shared), success[0], *success[1], regret[0], *regret[1], outcome, why)
 

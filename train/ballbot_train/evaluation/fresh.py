@@ -34,7 +34,7 @@ from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
 from ballbot_train.evaluation.controllers import ControllerName, as_controller
 from ballbot_train.evaluation.results import near_share, to_json, warn_of_small
-from ballbot_train.evaluation.statistics import share_interval
+from ballbot_train.evaluation.statistics import Interval
 from ballbot_train.policy.layers import with_compiled_layers
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
 from ballbot_train.work import jobs
@@ -134,8 +134,8 @@ class FreshResult:
         warn_of_small(self.optima)
         n, failures = len(self), int(self.failure.sum())
         success = int(self.success.sum())
-        success_low, success_high = share_interval(success, n)
-        failures_low, failures_high = share_interval(failures, n)
+        success_low, success_high = Interval.of_share(success, n)
+        failures_low, failures_high = Interval.of_share(failures, n)
         kinds = [name.partition(" ")[0] for name in self.violated if name]  # "obstacle 3" is an obstacle
         return _Summary(
             episodes=n,

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ballbot_gym import files
 from ballbot_gym.certified import version
 from ballbot_gym.trajectory import Displayed
 from ballbot_train.evaluation.names import shortened, with_way
-from ballbot_train.evaluation.statistics import interval
+from ballbot_train.evaluation.statistics import Interval, shown
 
 _LEADERBOARD = "leaderboard"
 SMALL = 0.01
@@ -116,7 +116,7 @@ def warn_of_small(optima: Sequence[float] | np.ndarray) -> None:
         )
 
 
-def counted(violated: Iterable[str]) -> str:
+def _counted(violated: Iterable[str]) -> str:
     """How many episodes failed at which kind of limit, the most frequent first; their other entries are ""."""
     kinds = Counter(name.partition(" ")[0] for name in violated if name)  # "obstacle 3" is an obstacle
     return ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
@@ -148,7 +148,7 @@ def _row(results: Sequence[Result], seed: int) -> Row:
 
     regrets = [result.regret for result in standing]
     warn_of_small([result.optimum for result in results])
-    low, high = interval(regrets, seed)
+    low, high = Interval.of_mean(regrets, seed)
     return Row(
         task=results[0].task,
         controller=results[0].controller,
@@ -156,7 +156,7 @@ def _row(results: Sequence[Result], seed: int) -> Row:
         episodes=len(results),
         success=float(np.mean([result.success for result in results])),
         falls=len(results) - len(standing),
-        failed_by=counted(result.violated for result in results),
+        failed_by=_counted(result.violated for result in results),
         near=near_share([result.goal_error for result in results], [result.failure for result in results]),
         regret_mean=float(np.mean(regrets)) if regrets else math.nan,
         regret_low=low,
@@ -269,24 +269,13 @@ def _or_null(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def shown(value: float, form: str, unit: str = "") -> str:
-    """A figure of a table; a dash where there is none."""
-    return format(value, form) + unit if math.isfinite(value) else "–"
-
-
-def with_interval(value: float, low: float, high: float, sign: Literal["", "+"] = "") -> str:
-    """A share with its interval in per cent, with plus signs if wanted; a dash where there is none."""
-    ends = f" ({100 * low:{sign}.2f} to {100 * high:{sign}.2f})" if math.isfinite(low) else ""
-    return shown(100 * value, f"{sign}.2f", " %") + ends
-
-
 TABLE: dict[str, Callable[[Row], str]] = {
     "task": lambda row: row.task,
     "controller": lambda row: row.controller,
     "physics": lambda row: row.physics,
     "success": lambda row: success_text(row.success, row.near),
     "falls": lambda row: f"{row.falls}/{row.episodes}" + (f" ({row.failed_by})" if row.failed_by else ""),
-    "regret mean": lambda row: with_interval(row.regret_mean, row.regret_low, row.regret_high),
+    "regret mean": lambda row: Interval(row.regret_low, row.regret_high).text(row.regret_mean),
     "regret median": lambda row: _percent(row.regret_median),
     "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),
     "settle": lambda row: shown(row.settle_time_median, ".2f", " s"),

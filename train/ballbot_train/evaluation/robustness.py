@@ -23,8 +23,9 @@ import numpy as np
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, TRACKS, Randomization
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.results import Result, Row, leaderboard, shown
+from ballbot_train.evaluation.results import Result, Row, leaderboard
 from ballbot_train.evaluation.runner import Group
+from ballbot_train.evaluation.statistics import shown
 from ballbot_train.policy.files import track_in
 
 

@@ -28,7 +28,8 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.judge import MISSED, NO_PLAN, STEERED, SUCCESS, Steps, SubmissionError
 from ballbot_train.evaluation.names import file_part
-from ballbot_train.evaluation.results import Result, leaderboard, to_json, with_interval
+from ballbot_train.evaluation.results import Result, leaderboard, to_json
+from ballbot_train.evaluation.statistics import Interval
 
 LEAST_REGRET = {"rk4": (-1e-3, -1e-4), "bullet": (-0.01, -0.002), "mujoco": (-0.01, -0.002)}
 """Of an episode, and of the mean of a row: what the engine's difference from the optimum's closed form explains."""
@@ -140,7 +141,7 @@ class Entry:
         """The mean regret with its interval, %; a dash where every episode failed."""
         numbers = self.regret_mean, self.regret_low, self.regret_high
         mean, low, high = (math.nan if value is None else value for value in numbers)
-        return with_interval(mean, low, high)
+        return Interval(low, high).text(mean)
 
     @property
     def file(self) -> str:
