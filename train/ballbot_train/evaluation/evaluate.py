@@ -49,16 +49,12 @@ def evaluate(
 def evaluate(
     policy: Any,
     task: str | Task = ...,
-    episodes: int = ...,
-    physics: str | None = ...,
+    *,
+    fresh: int,
     name: str | None = ...,
     randomization: Randomization | str | None = ...,
     robot: str | Robot = ...,
-    workers: int | Workers = ...,
-    out: str | Path | None = ...,
     filter: str | None = ...,
-    *,
-    fresh: int,
 ) -> "FreshResult": ...
 
 
