@@ -23,7 +23,6 @@ from ballbot_train.report.replay import (
     Replay,
     Take,
     certified_replay,
-    file_replay,
 )
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
@@ -106,9 +105,9 @@ def test_the_same_episode_starts_alike_under_every_controller():
 
 def test_files_called_the_same_are_told_apart_by_their_folders(tmp_path):
     paths = [lean(to).save(tmp_path / name / "trajectory.npz") for name, to in (("a", 0.1), ("b", 0.2))]
-    assert [take.label for take in file_replay(paths).takes] == ["a/trajectory", "b/trajectory"]
+    assert [take.label for take in Replay.of_files(paths).takes] == ["a/trajectory", "b/trajectory"]
     with pytest.raises(TrajectoryError, match="nowhere"):
-        file_replay([tmp_path / "nowhere.npz"])
+        Replay.of_files([tmp_path / "nowhere.npz"])
 
 
 def test_the_command_draws_a_strip_named_after_the_episode(tmp_path):

@@ -13,7 +13,7 @@ from ballbot_train.commands.options import Filter
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.report.film import Format, film_frames, write_film, write_strip
-from ballbot_train.report.replay import certified_replay, file_replay
+from ballbot_train.report.replay import Replay, certified_replay
 from ballbot_train.work.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 
 _MOST_FRAMES = 100_000
@@ -66,7 +66,7 @@ def replay(
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
         paths = [Path(entry) for entry in source]
-        shown, name = file_replay(paths), "+".join(file_part(str(path)) for path in paths)
+        shown, name = Replay.of_files(paths), "+".join(file_part(str(path)) for path in paths)
     else:
         _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
         check_names("task", source, TASKS)

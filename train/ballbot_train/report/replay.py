@@ -74,6 +74,19 @@ class Replay:
     markers: tuple[Marker, ...] = ()
     params: Robot = field(default_factory=default_params)
 
+    @classmethod
+    def of_files(cls, paths: Sequence[Path]) -> "Replay":
+        """Trajectory files side by side.
+
+        Raises:
+            TrajectoryError: a file is missing or holds no trajectory.
+        """
+        takes, names = [], shortened(map(str, paths))
+        for i, path in enumerate(paths):
+            label = names[str(path)].removesuffix(path.suffix)
+            takes.append(Take(label, Trajectory.load(path), labels.color(path.stem, i)).playable(str(path)))
+        return cls(", ".join(take.label for take in takes), tuple(takes))
+
     @property
     def duration(self) -> float:
         """The duration of the longest take, s."""
@@ -163,16 +176,3 @@ def telling_episode(task: str, results: Sequence[Result]) -> int:
         if result.task == task:
             failures.setdefault(result.episode, set()).add(result.failure)
     return next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
-
-
-def file_replay(paths: Sequence[Path]) -> Replay:
-    """Trajectory files side by side.
-
-    Raises:
-        TrajectoryError: a file is missing or holds no trajectory.
-    """
-    takes, names = [], shortened(map(str, paths))
-    for i, path in enumerate(paths):
-        label = names[str(path)].removesuffix(path.suffix)
-        takes.append(Take(label, Trajectory.load(path), labels.color(path.stem, i)).playable(str(path)))
-    return Replay(", ".join(take.label for take in takes), tuple(takes))
