@@ -61,7 +61,7 @@ def certify(
     if shards is not None:
         _certify_shards(tasks, episodes, shards, out, workers, robot)
         return
-    jobs.make_folder(out)
+    jobs.RunFolder(out).make()
     failures = []
     for name in tasks:
         of = own_robot(name, robot)

@@ -83,7 +83,7 @@ def compute(
     """
     needed = list(dict.fromkeys(episodes))
     folder = cache.folder(task, params, randomization)
-    jobs.make_folder(folder)
+    jobs.RunFolder(folder).make()
     lock = filelock.FileLock(folder / "computing.lock")
     try:
         held = lock.acquire(timeout=0)

@@ -65,18 +65,6 @@ class Job:
     """What its progress counts for."""
 
 
-def make_folder(out: Path) -> None:
-    """Makes the folder of a run, unless it is there. Call it before the work, which would else be lost.
-
-    Raises:
-        ValueError: there is a file of that name, or of the name of a folder above.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ValueError(f"{out} cannot be a folder, because a file is in its place; give another --out") from error
-
-
 class RunFolder:
     """The folder of a run, which belongs to one configuration and to one process at a time."""
 
@@ -88,6 +76,19 @@ class RunFolder:
     def unfinished(self) -> Path:
         """The folder within that only serves to continue the run; `release` deletes it."""
         return self.out / _FOLDER
+
+    def make(self) -> None:
+        """Makes the folder, unless it is there. Call it before the work, which would else be lost.
+
+        Raises:
+            ValueError: there is a file of that name, or of the name of a folder above.
+        """
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise ValueError(
+                f"{self.out} cannot be a folder, because a file is in its place; give another --out"
+            ) from error
 
     def claim(self, config: Mapping[str, Any], facts: Mapping[str, Any] | None = None) -> None:
         """Marks the folder as belonging to one configuration, and locks it for this process until `release` or `unlock`.
@@ -141,7 +142,7 @@ class RunFolder:
         if self._is_held:
             return
         self.unlock()  # the folder was deleted meanwhile, and the lock with it
-        make_folder(self.out)
+        self.make()
         while not self._is_held:  # a lock that another process deleted between our opening and locking it is no lock
             lock = filelock.FileLock(self.out.resolve() / _LOCK, timeout=0, thread_local=False)
             try:
