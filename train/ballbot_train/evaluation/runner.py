@@ -138,9 +138,8 @@ class MeasuredRun:
         for path in (out / f"{name}.json" for name in _TABLES):
             if path.exists():
                 about = files.read_json(path).get("about")
-                held = (
-                    {key: value for key, value in about.items() if key in settings} if isinstance(about, dict) else {}
-                )
+                named = about if isinstance(about, dict) else {}
+                held = {key: value for key, value in named.items() if key in settings}
                 jobs.check_same(held, settings, out, "results")
         facts = {"benchmark": version.BENCHMARK} | provenance() | settings
         facts["workers"] = Workers.of(workers).here or "a Ray cluster"
