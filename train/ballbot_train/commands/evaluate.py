@@ -123,7 +123,7 @@ def _evaluate_fresh(
         from ballbot_train.evaluation.adversarial import check_searchable
 
         check_searchable(make_task(task, robot), varied)
-    jobs.make_folder(out)
+    jobs.RunFolder(out).make()
     of = {"task": task, "policy": policy, "robot": robot, "randomization": varied.track}
     if (out / "fresh.json").exists():  # of the same policy they are replaced
         about = files.read_json(out / "fresh.json").get("about")
@@ -156,8 +156,15 @@ def _search(result: Any, policy: str, task: str, out: Path, workers: Workers, ro
 
     with progress_bars({"searches": min(adversarial.SEARCHES, len(result))}) as advance:
         began, ended = adversarial.hard_starts(policy, result, workers, partial(advance, "searches"))
-    numbers = {name: getattr(ended, name).tolist() for name in ("success", "failure", "costs", "optima", "regrets")}
-    numbers |= {"regrets_before": began.regrets.tolist()}
+    columns = {
+        "success": ended.success,
+        "failure": ended.failure,
+        "cost": ended.costs,
+        "optimum": ended.optima,
+        "regret": ended.regrets,
+        "regret_before": began.regrets,
+    }
+    numbers = {name: values.tolist() for name, values in columns.items()}
     numbers |= {f"x{k}": values.tolist() for k, values in enumerate(ended.states.T)}
     numbers |= dict(zip(result.task.constant_names, ended.constants.T.tolist(), strict=True))
     lines = [dict(zip(numbers, values, strict=True)) for values in zip(*numbers.values(), strict=True)]
