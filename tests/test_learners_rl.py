@@ -285,4 +285,4 @@ def test_a_failure_among_thousands_of_steps_moves_actor_and_critic_about_as_much
         buffer.rewards[-1, 7] -= 1000.0 * failed
         buffer.compute_returns_and_advantage(torch.zeros(128), np.zeros(128, bool))
         moved.append([np.abs(values).max() for values in (buffer.advantages, buffer.returns - buffer.values)])
-    assert all(after < 4 * before for before, after in zip(*moved, strict=True))
+    assert all(after < 11 * before for before, after in zip(*moved, strict=True))

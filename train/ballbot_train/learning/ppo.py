@@ -133,14 +133,15 @@ MAX_GRAD_NORM = 1.0
 _WARM_CRITIC_RATE = 1e-3  # learning rate of the critic throughout after a warm start, where the actor's is small
 
 
-_LARGEST_ADVANTAGE = 3.0  # to which others are clipped; in multiples of what 99 % of an iteration's stay below
+_LARGEST_ADVANTAGE = 10.0  # to which others are clipped; in multiples of what 99 % of an iteration's stay below
 
 
 class _Rollouts(RolloutBuffer):
     """A rollout buffer of clipped advantages, which may be relative to the cost to go.
 
-    A failure costs thirty times what an episode does. When nearly all episodes succeed, one that fails has advantages far
-    beyond all others. They would decide the gradient of their batch, and spoil the critic for dozens of iterations.
+    A failure costs thirty times what an episode of Stabilize does. When nearly all episodes succeed, one that fails has
+    advantages far beyond all others. They would decide the gradient of their batch, and spoil the critic for dozens of
+    iterations. A lower limit teaches too little of failures: at 3 Weave's policy touched obstacles twice as often as at 10.
     """
 
     def __init__(self, *args: Any, living: Callable[[float], float] | None = None, **kwargs: Any):
