@@ -77,7 +77,8 @@ def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: MEASURED_AS)
     monkeypatch.setattr(model_free, "_CLONE_ITERATIONS", 1)
-    monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda episodes: 2)
+    for command in ("benchmark", "evaluate", "robustness"):
+        monkeypatch.setattr(f"ballbot_train.commands.{command}.checked_episodes", lambda episodes: 2)
     monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
     monkeypatch.setattr(fresh, "evaluate_fresh", lambda policy, task, count, *more: real(policy, task, 20, *more))
     optima = fresh.FreshResult.with_optima

@@ -79,9 +79,9 @@ def test_a_client_that_reads_nothing_holds_up_nobody(viewer, params):
         head = f"GET /stream HTTP/1.1\r\nHost: localhost:{viewer.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         stuck.sendall(f"{head}{key}\r\n".encode())
         wait_for(lambda: len(viewer._clients) == 2)
-        for k in range(100):  # 20 MB
+        for k in range(40):  # 8 MB
             viewer.draw(Drawing(params, (Drawn(STATE + k),), path))
-        wait_for(lambda: other.seen.get("moment", {"robots": [{"x": [0]}]})["robots"][0]["x"][0] == 99.5)
+        wait_for(lambda: other.seen.get("moment", {"robots": [{"x": [0]}]})["robots"][0]["x"][0] == 39.5)
         began = time.monotonic()
         viewer.close()  # which does not wait for it either
         assert time.monotonic() - began < 5

@@ -52,7 +52,8 @@ def benchmark(
     chosen = made_for[robot]
     robots = {task: own_robot(task, robot) for task in tasks}
     physics = physics_or_default(physics, robots[tasks[0]])
-    settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
+    episodes = checked_episodes(episodes)
+    settings: dict[str, Any] = {"physics": physics, "episodes": episodes, "seed": seed}
     if randomization:
         for track in randomization:
             Randomization.checked(track)

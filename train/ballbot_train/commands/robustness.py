@@ -47,7 +47,8 @@ def robustness(
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
     physics = physics_or_default(physics, robot)
     check_names("stress", stresses, stressed.STRESSES, least=1)
-    settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
+    episodes = checked_episodes(episodes)
+    settings = {"physics": physics, "episodes": episodes, "seed": seed}
     run = MeasuredRun.open(out, workers, {robot: chosen}, robot, **settings)
     results = run.measure(stressed.groups_of(chosen, stresses, physics, robot), episodes, seed)
     rows = leaderboard(results, seed)
