@@ -50,6 +50,9 @@ class Outcome(NamedTuple):
     """Index of the first limit that is violated, of `limit_names`; −1 for none."""
 
 
+FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
+"""The truth values of a step, in the order in which vector envs keep them: four of its `Outcome`, and `Step.clipped`."""
+
 PAY = ("reward", "cost", "reward_survive", "reward_cost", "reward_goal")
 """The fields of an `Outcome` that add up over an episode, in the order in which vector envs keep them."""
 

@@ -18,10 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ballbot_gym import files
-from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation.controllers import ControllerName, controllers_of
+from ballbot_train.evaluation.controllers import controllers_of, policy_digests
 
 PICTURES = Path(__file__).parent / "pictures"
 MADE = PICTURES / "made.json"
@@ -41,13 +39,7 @@ class Make:
 
     def policies(self) -> dict[str, str]:
         """SHA-256 of the weights of the policies that are shipped now, by TASK/NAME."""
-        chosen = controllers_of(self.tasks, self.names)[PAPER] if self.tasks else {}
-        return {
-            f"{task}/{name}": file.weights_digest()
-            for task, names in chosen.items()
-            for name in names
-            if (file := ControllerName(name).file(make_task(task))) is not None
-        }
+        return policy_digests(controllers_of(self.tasks, self.names)) if self.tasks else {}
 
 
 MAKES = [

@@ -15,7 +15,7 @@ from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.machine_code.single import StepProblem
 from ballbot_gym.robot import Randomization, Robot
-from ballbot_gym.step import PAY, StepState, step
+from ballbot_gym.step import FLAGS, PAY, StepState, step
 from ballbot_gym.tasks import Task
 
 with imports_of("the machine code of batches", "baselines"):
@@ -23,9 +23,6 @@ with imports_of("the machine code of batches", "baselines"):
 
 LANES = 16
 """Robots per block: as many float32 as an AVX-512 register holds."""
-
-FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
-"""The flags of a step, in the order in which the C code writes them."""
 
 Part = tuple[str, Sequence[Any]]
 """A pointer's name in C, and the symbols that are read from its rows, or the expressions that are written to them."""

@@ -100,7 +100,7 @@ enum { CHUNK = 32 * LANES };
 /* Rows of what is reported of a robot: state, measurements, force, the floor's grip. */
 enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, REPORTED = GRIPPED + GRIP };
 
-/* Rows of flags, which are those of codegen.FLAGS and one more; and of pay, which are those of step.PAY. */
+/* Rows of flags, which are those of step.FLAGS and one more; and of pay, which are those of step.PAY. */
 enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
 enum { REWARD, COST, SURVIVE, RUNNING, GOAL, PAYS };
 

@@ -27,7 +27,7 @@ from ballbot_gym.robot import (
     Sensors,
 )
 from ballbot_gym.seeding import seeds_of
-from ballbot_gym.step import Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
+from ballbot_gym.step import FLAGS, Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.state import BatchState, _check_starts
 
@@ -48,10 +48,6 @@ COMPILE_OPTIONS: dict[str, Any] = {
     "realize_reads_threshold": 1,
 }
 """Options of torch.compile for code that steps a batch."""
-
-_FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
-"""The fields of `BatchStep` that are bools."""
-
 
 _FIXED = ("task", "params", "randomization", "history", "observation", "num_envs", "device", "dtype", "limit_names")
 """Attributes of a batch that cannot be set once it is made: more is computed from them."""
@@ -437,7 +433,7 @@ class BallbotBatch:
 
 def _typed(result: BatchStep) -> BatchStep:
     """A step whose flags and `violated` are numbers, with bools and an int64."""
-    flags = {name: getattr(result, name) > 0 for name in _FLAGS}
+    flags = {name: getattr(result, name) > 0 for name in FLAGS}
     return result._replace(violated=result.violated.long(), **flags)
 
 

@@ -34,7 +34,7 @@ less for 4,096."""
 
 
 FLAG_ROWS = 6
-"""Rows of flags: those of `codegen.FLAGS`, and whether the episode is done."""
+"""Rows of flags: those of `step.FLAGS`, and whether the episode is done."""
 
 State = Any
 """A `BatchState` whose fields are NumPy arrays."""

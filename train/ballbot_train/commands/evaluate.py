@@ -12,7 +12,7 @@ from ballbot_gym.registry import own_robot
 from ballbot_gym.robot import PAPER, Randomization, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.options import Filter, WorkersOption
-from ballbot_train.evaluation.controllers import ControllerName, controllers_of
+from ballbot_train.evaluation.controllers import ControllerName, controllers_of, policy_digests
 from ballbot_train.evaluation.names import file_part
 from ballbot_train.evaluation.results import TABLE, leaderboard
 from ballbot_train.evaluation.runner import Group, MeasuredRun, checked_episodes
@@ -129,10 +129,9 @@ def _evaluate_fresh(
         about = files.read_json(out / "fresh.json").get("about")
         held = {name: about.get(name, of[name]) for name in of} if isinstance(about, dict) else {}
         jobs.check_same(held, of, out, "results")
-    file = ControllerName(policy).file(make_task(task, robot), robot)
     facts = provenance() | {
         **of,
-        "policies": {} if file is None else {f"{task}/{policy}": file.weights_digest()},
+        "policies": policy_digests({robot: {task: [policy]}}, robot),
         "seed": seed,
         "episodes": count,
         "physics": "closed form, batched, float64",

@@ -6,7 +6,7 @@ import inspect
 import itertools
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -393,3 +393,24 @@ def controllers_of(
                 raise ValueError(f"unknown controller {name.text} for the robot {robots[0]}; {hint}")
     check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
     return chosen
+
+
+def policy_digests(
+    chosen: Mapping[str, Mapping[str, Sequence[str]]],
+    robot: str = PAPER,
+    of: Callable[[PolicyFile], str] = PolicyFile.weights_digest,
+) -> dict[str, str]:
+    """A digest of every learned policy under "TASK/NAME", or "ROBOT/TASK/NAME" of policies made for another robot.
+
+    Args:
+        chosen: controllers as `controllers_of` gives them.
+        robot: on which they run, by name.
+        of: which digest.
+    """
+    return {
+        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(file)
+        for made_for, by_task in chosen.items()
+        for task, group in by_task.items()
+        for name in group
+        if (file := ControllerName(name).file(make_task(task, made_for), made_for)) is not None
+    }

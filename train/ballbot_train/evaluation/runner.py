@@ -24,7 +24,7 @@ from ballbot_gym.robot import PAPER, Randomization, Robot, named_robot, robot_se
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.controllers import ControllerName, as_controller
+from ballbot_train.evaluation.controllers import ControllerName, as_controller, policy_digests
 from ballbot_train.evaluation.recordings import Recording
 from ballbot_train.evaluation.results import Result, Row, table_cells, write_results
 from ballbot_train.policy.files import PolicyFile, shipped_ways
@@ -126,7 +126,7 @@ class MeasuredRun:
         """
         check_least(0, seed=settings.get("seed", 0))
         digests = PolicyFile.weights_digest, PolicyFile.network_digest
-        policies, networks = (_digests(chosen, robot, of) for of in digests)
+        policies, networks = (policy_digests(chosen, robot, of) for of in digests)
         problems = {
             task if name == robot else f"{name}/{task}": certified.named_problem(task, name)
             for made_for, by_task in chosen.items()
@@ -214,19 +214,6 @@ class MeasuredRun:
         files.write(self.out / f"{name}.md", markdown(header, table))
         jobs.RunFolder(self.out).release()
         print_table(title, header, table)
-
-
-def _digests(
-    chosen: Mapping[str, Mapping[str, Sequence[str]]], robot: str, of: Callable[[PolicyFile], str]
-) -> dict[str, str]:
-    """A digest of every learned policy under "TASK/NAME", or "ROBOT/TASK/NAME" of policies made for another robot."""
-    return {
-        f"{task}/{name}" if made_for == robot else f"{made_for}/{task}/{name}": of(file)
-        for made_for, by_task in chosen.items()
-        for task, group in by_task.items()
-        for name in group
-        if (file := ControllerName(name).file(make_task(task, made_for), made_for)) is not None
-    }
 
 
 def _without_optima(states: np.ndarray) -> certified.EvaluationSet:
