@@ -31,7 +31,6 @@ from ballbot_gym.robot import (
     ROBOTS,
     Randomization,
     Robot,
-    Sensors,
     checked_robot,
     named_robot,
     robot_name,
@@ -233,11 +232,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         self._constants, self._measured = np.zeros(0), tuple(each.name for each in self.params.MEASUREMENTS)
         # read in every step
         self._varies = self.randomization.varies_episodes
-        self._draws = Draws(
-            (0.0,) * (Randomization.PUSH_DRAWS * self.randomization.pushes),
-            (0.0,) * (Sensors.DRAWS * self._senses),
-            (0.0,) * (Randomization.NOISE_DRAWS * self.randomization.is_noisy),
-        )
+        self._draws = self.step_problem.draws()
         self._random = any(self._draws)
         self._start_draws = start_draws(self.task, self.randomization, self._senses)
         self._action_shape, self._human = self.action_space.shape, render_mode == "human"

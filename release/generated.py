@@ -125,7 +125,7 @@ def write_sources(folder: Path) -> None:
     for robot, task, physics in itertools.product(ROBOTS, TASKS, installed_physics()):
         params = ROBOTS[robot].params
         problem = BallbotEnv(task, physics, robot=robot).step_problem
-        (folder / f"{problem.code_name(params)}.c").write_text(codegen.single_source(problem), encoding="utf-8")
+        (folder / f"{problem.code_name(params)}.c").write_text(problem.source(), encoding="utf-8")
 
 
 def read(folder: Path) -> list[Code]:

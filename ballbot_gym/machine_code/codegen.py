@@ -7,13 +7,12 @@ it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.machine_code.single import StepProblem
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.step import FLAGS, PAY, StepState, step
 from ballbot_gym.tasks import Task
@@ -113,26 +112,32 @@ def source(task: Task, params: Robot, double: bool) -> str:
     return "\n".join([*defined, text("real.h"), text("native.c"), *blocks])
 
 
-def single_source(problem: StepProblem) -> str:
-    """The C code `void compute(double *numbers)` of a step of one environment.
+def single_source(
+    arguments: Mapping[str, int], compute: Callable[[dict[str, Any]], Mapping[str, Sequence[Any]]]
+) -> str:
+    """The C code `void compute(double *numbers)` of a function from named numbers to named numbers, as that of a step.
 
-    The numbers are the problem's results, then the arguments of the step, then those of the episode.
+    The numbers are the results, then the arguments.
+
+    Args:
+        arguments: their names, and how many numbers each has.
+        compute: from arguments by name to results by name.
 
     Raises:
         Exception: as `source`.
     """
-    given = {name: _symbols(f"{name}_", size) for name, size in (problem.of_step() | problem.of_episode()).items()}
-    results = problem.computed(given)
-    count, arguments, at = len(results), [], 0
+    given = {name: _symbols(f"{name}_", size) for name, size in arguments.items()}
+    results = compute(given)
+    count, pointers, at = len(results), [], 0
     for part in (*results.values(), *given.values()):
-        arguments.append(f"numbers + {at}, 1")
+        pointers.append(f"numbers + {at}, 1")
         at += len(part)
     code = block(
         "one",
         [(f"given_{name}", part) for name, part in given.items()],
         [(f"made_{name}", part) for name, part in results.items()],
     )
-    called = ", ".join((*arguments[count:], *arguments[:count]))
+    called = ", ".join((*pointers[count:], *pointers[:count]))
     return "\n".join(
         [
             "#define DOUBLE 1\n#define LANES 1",

@@ -44,6 +44,12 @@ class StepProblem(NamedTuple):
     contact: bool
     """Whether this engine simulates the floor's force on the ball."""
 
+    def draws(self) -> Draws:
+        """Zeros, as many as a step draws uniform numbers."""
+        varied = self.variation
+        counts = varied.PUSH_DRAWS * varied.pushes, Sensors.DRAWS * self.senses, varied.NOISE_DRAWS * varied.is_noisy
+        return Draws._make((0.0,) * count for count in counts)
+
     def of_episode(self) -> dict[str, int]:
         """Arguments that stay the same during an episode: names, and how many numbers each has."""
         robot, drawn = len(self._numbers), self.variation.episode_draws * self.variation.varies_episodes
@@ -56,7 +62,7 @@ class StepProblem(NamedTuple):
 
     def of_step(self) -> dict[str, int]:
         """The other arguments."""
-        kind, variation, engine = self.kind.robot, self.variation, not self.substeps
+        kind, variation, engine, z = self.kind.robot, self.variation, not self.substeps, self.draws()
         states, actions = len(kind.STATE), len(kind.ACTION)
         return {
             "x": states,
@@ -64,9 +70,9 @@ class StepProblem(NamedTuple):
             "actuator": len(variation.resting((0.0,) * actions, self.task.control_dt)),
             "sensors": Sensors.MEMORY * self.senses,
             "action": actions,
-            "push": variation.PUSH_DRAWS * variation.pushes,
-            "read": Sensors.DRAWS * self.senses,
-            "noise": variation.NOISE_DRAWS * variation.is_noisy,
+            "push": len(z.push),
+            "read": len(z.sensors),
+            "noise": len(z.noise),
             "end": states * engine,
             "floor": 3 * self.contact,
             "stable": int(engine),
@@ -119,6 +125,17 @@ class StepProblem(NamedTuple):
         task, *rest = self
         problem = problem_digest(task, named_robot(first_of_kind(robot)))
         return f"one-{type(task).__name__.lower()}-{digest(problem, [repr(each) for each in rest])}"
+
+    def source(self) -> str:
+        """The C code of the step; its arguments are those of the step, and then those of the episode.
+
+        Raises:
+            ImportError: CasADi is missing.
+            Exception: any error of a task that cannot compute with symbols.
+        """
+        from ballbot_gym.machine_code import codegen  # it imports CasADi
+
+        return codegen.single_source(self.of_step() | self.of_episode(), self.computed)
 
     def numbers(self, robot: Robot) -> list[float]:
         """A robot's numbers, as the code takes them."""
@@ -222,10 +239,7 @@ def _function(problem: StepProblem, robot: Robot) -> Callable[..., None]:
         Exception: any error of a task that cannot compute with symbols.
     """
     source = shipped_source(problem.code_name(robot)) if find_spec("casadi") is None else None
-    if source is None:
-        from ballbot_gym.machine_code import codegen  # it imports CasADi
-
-        source = codegen.single_source(problem)
+    source = problem.source() if source is None else source
     path = machine_code.library(f"one-{type(problem.task).__name__.lower()}", source, FLAGS)
     function = ctypes.PyDLL(str(path)).compute  # it keeps the GIL: it is short
     function.argtypes, function.restype = (ctypes.c_void_p,), None

@@ -125,9 +125,9 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         build: Any = _in_torch if find_spec("torch") is not None else _without_torch
         given = {"randomization": randomization, "history": history, "observation": observation}
         batch = build(engine, task, num_envs, device, dtype, compile, params, **given)
-        self.batch: BallbotBatch | BallbotNative = batch
-        self._native: BallbotNative | None = batch if isinstance(batch, BallbotNative) else None
-        self._dtype = self._native.dtype if self._native else np.dtype(str(batch.dtype).rpartition(".")[2]).type
+        self.batch: BallbotBatch | BallbotArrays = batch
+        self._arrays: BallbotArrays | None = batch if isinstance(batch, BallbotArrays) else None
+        self._dtype = self._arrays.dtype if self._arrays else np.dtype(str(batch.dtype).rpartition(".")[2]).type
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.history, self.observation = self.batch.history, self.batch.observation
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
@@ -206,7 +206,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 'options={"reset_mask": mask}'
             )
         batch: Any = self.batch
-        result = self._native.step(actions, waiting) if self._native else step(batch, actions, waiting)
+        result = self._arrays.step(actions, waiting) if self._arrays else step(batch, actions, waiting)
         if not batch.restarts:
             self._ended = result[2] | result[3]
         return result
@@ -261,7 +261,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
 
     def _to_batch(self, array: np.ndarray) -> Any:
         """The array as the batch takes it."""
-        if self._native:
+        if self._arrays:
             return array
         import torch
 
@@ -300,7 +300,7 @@ def _in_torch(
     compile: bool | str,
     params: Robot,
     **settings: Any,
-) -> BallbotBatch | BallbotNative:
+) -> BallbotBatch | BallbotArrays:
     """The batch of envs if torch is installed. The arguments are those of `BallbotVectorEnv`."""
     import torch
 
@@ -333,7 +333,7 @@ def _without_torch(
     randomization: Randomization | str | None,
     history: int,
     observation: str,
-) -> BallbotNative:
+) -> BallbotArrays:
     """The batch of envs if torch is missing. The arguments are those of `BallbotVectorEnv`.
 
     Raises:
@@ -363,7 +363,7 @@ def _without_gradients(
     params: Robot,
     plain: bool,
     threads: int,
-) -> BallbotNative | None:
+) -> BallbotArrays | None:
     """The envs in machine code or in NumPy. Where that is not possible: None, or an error if the engine must be that.
 
     Args:

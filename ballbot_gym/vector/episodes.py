@@ -1,4 +1,4 @@
-"""Episodes of a policy in a `BallbotBatch` or a `BallbotNative`: one of each environment, all at once."""
+"""Episodes of a policy in a `BallbotBatch` or a `BallbotArrays`: one of each environment, all at once."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ballbot_gym.lazy import imports_of
-from ballbot_gym.vector.native import BallbotNative
+from ballbot_gym.vector.arrays import BallbotArrays
 
 with imports_of(__name__):
     import torch
@@ -33,7 +33,7 @@ class BatchEpisodes(NamedTuple):
 
 @torch.no_grad()
 def run_episodes(
-    batch: BallbotBatch | BallbotNative,
+    batch: BallbotBatch | BallbotArrays,
     policy: Callable[[torch.Tensor], torch.Tensor],
     x: np.ndarray | torch.Tensor,
     c: np.ndarray | torch.Tensor,
@@ -42,13 +42,13 @@ def run_episodes(
     """Runs one episode of each environment, all at once and without gradients, until the last one has ended.
 
     Args:
-        batch: where to run; it is reset with seed 0. A `BallbotNative` is on the CPU, and nothing is drawn there.
+        batch: where to run; it is reset with seed 0. A `BallbotArrays` is on the CPU, and nothing is drawn there.
         policy: from observations (B, no) to actions (B, 2).
         x: (B, 8) initial states.
         c: (B, nc) constants of the episodes.
         drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
-    device: Any = "cpu" if isinstance(batch, BallbotNative) else batch.device
+    device: Any = "cpu" if isinstance(batch, BallbotArrays) else batch.device
     observation = _begun(batch, x, c, drawn)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=device)
     success = torch.zeros_like(running)
@@ -92,9 +92,9 @@ class _Stepped(NamedTuple):
     """(B,) bool."""
 
 
-def _begun(batch: BallbotBatch | BallbotNative, x: Any, c: Any, drawn: Any) -> torch.Tensor:
+def _begun(batch: BallbotBatch | BallbotArrays, x: Any, c: Any, drawn: Any) -> torch.Tensor:
     """Observations (B, no) of given starts (B, 8), constants (B, nc) and draws."""
-    if isinstance(batch, BallbotNative):
+    if isinstance(batch, BallbotArrays):
         if drawn is not None:
             raise ValueError("nothing is drawn in machine code; make a BallbotBatch")
         starts, constants = (np.asarray(part, batch.dtype).T for part in (x, c))
@@ -104,7 +104,7 @@ def _begun(batch: BallbotBatch | BallbotNative, x: Any, c: Any, drawn: Any) -> t
     return batch.reset(0, None, *(None if part is None else torch.as_tensor(part.T, **kind) for part in (x, c, drawn)))
 
 
-def _stepped(batch: BallbotBatch | BallbotNative, actions: torch.Tensor) -> _Stepped:
+def _stepped(batch: BallbotBatch | BallbotArrays, actions: torch.Tensor) -> _Stepped:
     if isinstance(batch, BallbotBatch):
         did = batch.step(actions)
         ended = did.terminated | did.truncated

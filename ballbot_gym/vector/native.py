@@ -1,4 +1,4 @@
-"""BallbotNative: what `BallbotBatch` does without gradients, in machine code that is compiled once per task and robot.
+"""BallbotNative: the envs of `BallbotArrays` in machine code, which is compiled once per task and robot.
 
 `codegen` writes the C code, `machine_code` compiles it within a second or two, and it serves batches of all sizes. Episodes
 are those of `BallbotBatch`: the same `seeding` numbers for the same seeds. Motions agree to rounding. They are
@@ -7,25 +7,20 @@ bit-identical for any size of the batch and any place of the env in it.
 
 import ctypes
 import os
-from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from ballbot_gym import machine_code
-from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.machine_code import NoMachineCodeError
-from ballbot_gym.robot import Randomization, Robot
-from ballbot_gym.seeding import seeds_of
+from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_digest
-from ballbot_gym.vector.autoreset import Info, Step, _as_gymnasium, _info_of
-from ballbot_gym.vector.state import BatchState
+from ballbot_gym.vector.arrays import FLAG_ROWS, BallbotArrays, Computed, State
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
@@ -33,22 +28,8 @@ _PARALLEL_FROM = 4096
 less for 4,096."""
 
 
-FLAG_ROWS = 6
-"""Rows of flags: those of `step.FLAGS`, and whether the episode is done."""
-
-State = Any
-"""A `BatchState` whose fields are NumPy arrays."""
-
-Computed = tuple[np.ndarray, ...]
-"""What a step computes, in the order of the last fields of `_Memory`."""
-
-
-@fixed("task", "params", "randomization", "history", "num_envs", "dtype")
-class BallbotNative:
-    """B ballbots that do one task, with the `state`, `initial_state`, `step` and `robot` of `BallbotBatch`.
-
-    The fields of `BatchState` and `BatchStep` are NumPy arrays. Arrays of a state are never written into.
-    """
+class BallbotNative(BallbotArrays):
+    """A `BallbotArrays` in machine code, checked against that before it is used. Arrays of a state are never written into."""
 
     compiled = True
 
@@ -64,8 +45,7 @@ class BallbotNative:
         """Makes the envs.
 
         Args:
-            task, num_envs, params: same as in `BallbotBatch`.
-            dtype: np.float32 or np.float64.
+            task, num_envs, dtype, params: same as in `BallbotArrays`.
             threads: among which large batches are divided.
             code: the library of `codegen`'s functions; default, that of the task and the robot.
 
@@ -73,44 +53,10 @@ class BallbotNative:
             NoMachineCodeError: CasADi or a C compiler is missing, or the task cannot be traced.
             ValueError: num_envs out of range.
         """
-        self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
-        self.randomization, self.history, self.threads = Randomization(), 0, threads
-        self.observation = "state"
-        self.most_steps, self.restarts = task.steps, True
-        self._state: State = None
+        super().__init__(task, num_envs, dtype, params)
+        self.threads = threads
         self._code = code or _code(task, params, dtype is np.float64)
-        self._all = np.arange(self.num_envs)
-        self._seen_rows = task.observation_size(params)
-        self._reported_rows = (
-            params.state_size + len(params.MEASUREMENTS) + params.action_size + (4 if params.grips else 0)
-        )
-        size, nothing = self.num_envs, np.zeros((0, self.num_envs), dtype)
-        x, c = (np.zeros((rows, size), dtype) for rows in (params.state_size, len(task.constant_names)))
-        seeds = np.array(seeds_of(int(np.random.SeedSequence().generate_state(1)[0]), size))
-        begun: Any = x, c, *np.zeros((2, size), np.int64), seeds, *(nothing,) * 4
-        self._unstarted: State = BatchState(*begun)
         self._kinds = [self._written(restarts) for restarts in (False, True)]
-
-    @property
-    def state(self) -> State:
-        """Everything that the environments remember; None before the first reset."""
-        return self._state
-
-    @state.setter
-    def state(self, state: State) -> None:
-        """Takes a state; machine code reads its memory, so every array must be of the right shape.
-
-        Raises:
-            ValueError: it is not.
-        """
-        if state is not None:
-            parts = []
-            for name, part, own in zip(BatchState._fields, state, self._unstarted, strict=True):
-                parts.append(np.ascontiguousarray(part, own.dtype))
-                if parts[-1].shape != own.shape:
-                    raise ValueError(f"{name} of a state must have shape {own.shape}, not {parts[-1].shape}")
-            state = BatchState(*parts)
-        self._state = state
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_code": None}
@@ -119,61 +65,10 @@ class BallbotNative:
         self.__dict__.update(state)
         self._code = _code(self.task, self.params, self.dtype is np.float64)
 
-    def initial_state(
-        self,
-        seed: int | Sequence[int | None] | None = None,
-        mask: np.ndarray | None = None,
-        c: np.ndarray | None = None,
-    ) -> State:
-        """As `BallbotBatch.initial_state`, with NumPy arrays."""
-        old = self.state
-        state: State = BatchState._make(part.copy() for part in old or self._unstarted)
-        which = self._all if old is None or mask is None else np.flatnonzero(mask)
-        state.episode[which] += old is not None
-        if seed is not None:
-            seeds = np.array([-1 if number is None else number for number in seeds_of(seed, self.num_envs)])
-            seeded = which[seeds[which] >= 0]
-            state.seed[seeded], state.episode[seeded] = seeds[seeded], 0
-        if c is not None:
-            state.c[:, which] = c[:, which]
-        self._start(which, state, c is not None)
-        state.steps[which] = 0
-        return state
-
     def _start(self, which: np.ndarray, state: State, given: bool) -> None:
         """Starts episodes in some envs of a state, in place; their constants are drawn unless they are given."""
         arrays = _pointers(which, state.seed, state.episode)
         self._code.ballbot_start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
-
-    def observe(self, state: State) -> np.ndarray:
-        """(B, no) observations of a state."""
-        return self._seen(state)[0].astype(np.float32, copy=False).T
-
-    def measurements(self, state: State) -> dict[str, np.ndarray]:
-        """(B,) what the robot measures in a state, by name."""
-        return self.params.named_measurements(self._seen(state)[1])
-
-    def step(self, actions: np.ndarray, waiting: np.ndarray | None = None) -> Step:
-        """Holds forces for one control step; see `autoreset.step`."""
-        old = self.state
-        if old is None:
-            raise gymnasium.error.ResetNeeded("step() before reset()")
-        begins, restarts = self.restarts or waiting is not None, self.restarts
-        (rows, seen, pay, flags, counts, c, last), bad = self._computed(old, actions, waiting)
-        if bad:  # what was computed is forgotten
-            check_finite(actions)
-        violated, steps, episode = counts[0], counts[1], counts[2]  # to unpack it takes three times as long
-        if not begins:
-            episode, c = old.episode, old.c
-        self._state = old._replace(x=rows[: self.params.state_size], c=c, steps=steps, episode=episode)
-        observation = seen.astype(np.float32, copy=False).T
-        ended = flags[5].nonzero()[0]
-        now, end = self._info(self._state, rows, pay[1:5], flags[2:5], violated), None
-        if restarts and ended.size:
-            rows = rows[self._reported_rows :]
-            end = self._info(old._replace(x=rows[: self.params.state_size]), rows, pay[5:], flags[6:], violated)
-            last = last.take(ended, 0)
-        return _as_gymnasium(observation, pay[0], flags[0], flags[1], now, end, last)
 
     def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
         """What a step from a state computes, and whether an action is not finite."""
@@ -203,15 +98,6 @@ class BallbotNative:
             ((len(self.task.constant_names), size), real),
             ((size * kept, self._seen_rows), single),
         ]
-
-    def _info(self, state: State, rows: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray) -> Info:
-        """An info of a state and of rows that native.c has written."""
-        measured = self.params.state_size
-        pulls = measured + len(self.params.MEASUREMENTS)
-        grip = pulls + self.params.action_size
-        force, (success, failure, clipped) = rows[pulls:grip], flags[:3]
-        did = pay[0], pay[1:], force, success, failure, clipped, rows[grip : self._reported_rows]
-        return _info_of(state, self.params.named_measurements(rows[measured:pulls]), violated, *did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and their measurements, a row (B,) each."""
@@ -261,8 +147,6 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
 
     For example, a symbol that is converted to a float silently becomes NaN.
     """
-    from ballbot_gym.vector.arrays import BallbotArrays  # a subclass of this module's class
-
     dtype = np.float64 if double else np.float32
     actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
     actions = np.asfortranarray(np.array(actions, dtype)[:, np.arange(params.action_size) % 3])
