@@ -1,6 +1,7 @@
 """A search for hard starts stays in the set of starts, and finds none that is easier than where it began."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,8 @@ def test_a_task_that_samples_in_its_own_way_and_hidden_parameters_are_refused():
         hard_starts(still, evaluate_fresh(still, "stabilize", 2, randomization="late"))
 
 
-def test_the_command_writes_the_starts_and_motions_that_replay_shows(typed, tmp_path):
+def test_the_command_writes_the_starts_and_motions_that_replay_shows(typed, tmp_path, monkeypatch):
+    monkeypatch.setattr(adversarial, "hard_starts", partial(hard_starts, rounds=2))
     code, said = typed(
         *("evaluate", "shac", "--task", "stabilize", "--fresh", "2", "--optima", "0"),
         *("--adversarial", "--workers", "1", "--out", str(tmp_path)),

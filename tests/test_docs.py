@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from stable_baselines3 import PPO
 from ballbot_gym import BallbotEnv, files, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands import COMMANDS
-from ballbot_train.evaluation import fresh
+from ballbot_train.evaluation import adversarial, fresh
 from ballbot_train.evaluation.submissions import read_entries
 from ballbot_train.learning import model_free, training
 from ballbot_train.policy.files import SHIPPED, PolicyFile, shipped_ways
@@ -84,6 +85,7 @@ def test_commands_run(page, typed, monkeypatch):
     optima = fresh.FreshResult.with_optima
     few = lambda result, count, workers: optima(result, min(count, 2), workers)  # noqa: E731
     monkeypatch.setattr(fresh.FreshResult, "with_optima", few)
+    monkeypatch.setattr(adversarial, "hard_starts", partial(adversarial.hard_starts, rounds=2))
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
         command = shlex.split(line, comments=True)

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -157,7 +158,7 @@ def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(monkeypatch)
 
 def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    evaluate("dagger", task="turn", fresh=60, workers=1)
+    evaluate("dagger", task="turn", fresh=60, optima=10, workers=1)
     out = tmp_path / "runs" / "evaluate" / "turn-dagger"
     document = json.loads((out / "fresh.json").read_text())
     assert document["summary"][0]["episodes"] == 60
@@ -202,12 +203,13 @@ def test_validation_prices_an_episode_without_success_as_failing_at_once():
 
 
 def test_results_of_another_policy_are_not_replaced(tmp_path):
-    evaluate("shac", task="stabilize", fresh=2, out=tmp_path)
+    few: dict[str, Any] = {"task": "stabilize", "workers": 1, "out": tmp_path}
+    evaluate("shac", fresh=2, **few)
     before = (tmp_path / "fresh.json").read_bytes()
     for policy, other in (("ppo", {}), ("shac", {"robot": "rolling"}), ("shac", {"randomization": "late"})):
         changed = next(iter(other), "policy")
         with pytest.raises(ValueError, match=f"holds results of {changed} .*; give another --out"):
-            evaluate(policy, task="stabilize", fresh=2, out=tmp_path, **other)
+            evaluate(policy, fresh=2, **few, **other)
     assert (tmp_path / "fresh.json").read_bytes() == before
-    evaluate("shac", task="stabilize", fresh=3, out=tmp_path)
+    evaluate("shac", fresh=3, **few)
     assert (tmp_path / "fresh.json").read_bytes() != before

