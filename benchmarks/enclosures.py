@@ -1,0 +1,153 @@
+"""Proves that certified optima are strict local minima of the problem as the environment computes it.
+
+`local_minimum.py` states the theorem and checks its hypotheses in interval arithmetic (`intervals.py`); a reader who trusts
+nothing reads these two files. Forces come from the certified set. A set has the forces of its first episodes alone; those of
+the others are searched again, and their costs are compared. Distances between forces are shares of the force limit, so of
+actions in [−1, 1].
+
+It writes enclosures.csv with a line for each episode, and prints a line for each task. It ends with exit status 1 if an
+optimum was not proven. An interrupted run continues in its folder.
+"""
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import tyro
+from local_minimum import NotProvenError, Problem, prove
+from stationary import stationary
+
+from ballbot_baselines import find_optima, find_optimum
+from ballbot_gym import certified, files
+from ballbot_gym.env import make_task
+from ballbot_gym.robot import PAPER, named_robot
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.work import jobs
+
+NEAR = 5e-6
+"""Largest distance of a minimum from the stored forces: five times the reserve that the solvers keep from a goal."""
+SAME_COST = 1e-5
+"""Largest difference between a stored cost and that of the minimum: what these reserves cost is less."""
+_TOGETHER = 20  # episodes of a job
+
+
+def enclosed(problem: Problem, motion: Trajectory, cost: float, stored: bool = True) -> jobs.Entry:
+    """Proves that there is a strict local minimum near a motion, of nearly this cost.
+
+    Args:
+        problem: the episode.
+        motion: states and forces.
+        cost: the certified cost.
+        stored: whether the forces are those of the certificate, so that the minimum must be near them.
+
+    Raises:
+        ArithmeticError: it could not be proven; the message names the hypothesis that fails.
+    """
+    point, linear = stationary(problem, motion.x, motion.u)
+    found = prove(problem, point, linear)
+    limit = problem.robot.force_limit
+    distance = float((np.abs(point.u - motion.u) + found.radius).max()) / limit
+    if stored and not distance < NEAR:
+        raise NotProvenError(f"the minimum is {distance:.2g} of the force limit away from the stored forces")
+    above = cost - found.low
+    if not abs(above) < SAME_COST:
+        raise NotProvenError(f"the minimum costs {found.low:.9g}, and not the certified {cost:.9g}")
+    return {
+        "radius": float(found.radius.max()) / limit,
+        "distance": distance if stored else None,
+        "cost": found.low,
+        "cost_width": found.high - found.low,
+        "stored_above": above,
+        "rounding": found.rounding,
+        "forces_at_bound": int(point.fixed.sum()),
+        "active_constraints": len(point.rows),
+        "least_multiplier": float(point.mu.min()) if point.rows else None,
+    }
+
+
+def lines(name: str, indices: Sequence[int]) -> Iterator[jobs.Entry]:
+    """A line for each of some episodes of a task."""
+    task, robot = make_task(name, PAPER), named_robot(PAPER)
+    known = certified.load(task, robot)
+    others = [i for i in indices if i >= len(known.trajectories)]
+    searched = find_optima(task, robot, known.states[others], known.constants[others]) if others else []
+    found = dict(zip(others, searched, strict=True))
+    for i in indices:
+        began, cost, stored = time.perf_counter(), float(known.costs[i]), i < len(known.trajectories)
+        line: jobs.Entry = {"task": name, "episode": i, "proven": 0, "why_not": ""}
+        try:
+            if stored:
+                motion = known.trajectories[i]
+            else:
+                optimum = found[i]
+                if optimum is None or abs(optimum.cost - cost) > SAME_COST:
+                    optimum = find_optimum(task, robot, known.states[i], known.constants[i], twice=True)
+                motion = optimum.trajectory
+            line |= enclosed(Problem(task, robot, tuple(known.constants[i].tolist())), motion, cost, stored)
+            line["proven"] = 1
+        except (ArithmeticError, PlanError) as error:
+            line["why_not"] = str(error)
+        yield line | {"seconds": time.perf_counter() - began}
+
+
+def main(
+    tasks: tuple[str, ...] = tuple(TASKS),
+    episodes: int = certified.EPISODES,
+    out: Path = Path("runs/enclosures"),
+    workers: int = 1,
+) -> None:
+    """Proves the certified optima of the paper's robot.
+
+    Args:
+        tasks: names of tasks.
+        episodes: the first of each certified set.
+        out: folder of the results; an interrupted run continues here.
+        workers: processes.
+    """
+    folder = jobs.RunFolder(out)
+    folder.claim({"tasks": tasks, "episodes": episodes})
+    work = [
+        jobs.Job(
+            f"{name}-{first:03d}",
+            lines,
+            (name,),
+            tuple(range(first, min(first + _TOGETHER, episodes))),
+            f"minima of {name}",
+        )
+        for first in range(0, episodes, _TOGETHER)
+        for name in tasks
+    ]
+    rows = [entry for part in jobs.run(work, out, workers) for entry in part]
+    rows.sort(key=lambda row: (tasks.index(row["task"]), row["episode"]))
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    files.write_csv(out / "enclosures.csv", [{name: row.get(name) for name in names} for row in rows])
+    for name in tasks:
+        print(_summary(name, [row for row in rows if row["task"] == name]))
+    folder.release()
+    if not all(row["proven"] for row in rows):
+        sys.exit(1)
+
+
+def _summary(name: str, rows: Sequence[jobs.Entry]) -> str:
+    proven = [row for row in rows if row["proven"]]
+    parts = [f"{name}: {len(proven)} of {len(rows)} minima enclosed, {sum(row['seconds'] for row in rows):.0f} s"]
+    if proven:
+        near = [row["distance"] for row in proven if row["distance"] is not None]
+        above = [abs(row["stored_above"]) for row in proven]
+        parts += [
+            f"radius at most {max(row['radius'] for row in proven):.1e} of the force limit; {sum(d < 1e-6 for d in near)} of "
+            f"{len(near)} within 1e-6 of stored forces, the farthest {max(near, default=0.0):.1e}",
+            f"cost enclosed to {max(row['cost_width'] for row in proven):.1e}; {sum(a < 1e-9 for a in above)} stored costs "
+            f"within 1e-9 of it, the farthest {max(above):.1e} away",
+            f"a step of the environment is rounded by at most {max(row['rounding'] for row in proven):.1e}",
+        ]
+    parts += [f"episode {row['episode']}: {row['why_not']}" for row in rows if not row["proven"]]
+    return "\n  ".join(parts)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

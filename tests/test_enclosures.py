@@ -1,0 +1,88 @@
+"""Proofs that optima are local minima: interval arithmetic holds what it should, and a changed optimum is refused."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballbot_gym import certified
+from ballbot_gym.env import make_task
+from ballbot_gym.robot import named_robot
+
+pytest.importorskip("casadi")
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from enclosures import enclosed
+from intervals import VARIABLES, Ball, derivatives, variables
+from local_minimum import NotProvenError, Problem
+
+DIGITS = 80
+
+
+@pytest.mark.parametrize(("radius", "digits"), [(0.0, np.float64), (1e-6, np.float64), (0.0, np.longdouble)])
+def test_balls_hold_a_step_and_its_derivatives_in_80_digits(radius: float, digits: type) -> None:
+    mpmath, rng = pytest.importorskip("mpmath"), np.random.default_rng(3)
+    robot, h = named_robot("paper"), mpmath.mpf(10) ** -15
+    scale = np.array([2, 2, 0.8, 0.8, 3, 3, 2, 2, 200, 200])
+    middle = (rng.uniform(-1, 1, VARIABLES) * scale).astype(digits)
+    point = middle + (radius * rng.uniform(-1, 1, VARIABLES)).astype(digits)
+    jets = variables(Ball(middle[None], np.full((1, VARIABLES), radius)), 2)
+    value, slope, bend = derivatives(robot.step(jets[:8], jets[8:], 0.02))
+    with mpmath.workdps(DIGITS):
+        exact = [mpmath.mpf(float(a)) + mpmath.mpf(float(a - digits(float(a)))) for a in point]
+
+        def step(*moves: tuple[int, int]) -> list:
+            moved = list(exact)
+            for i, sign in moves:
+                moved[i] += sign * h
+            return list(robot.step(tuple(moved[:8]), tuple(moved[8:]), 0.02))
+
+        def inside(numbers: list, ball: Ball) -> bool:
+            pairs = zip(numbers, ball.m, ball.r, strict=True)
+            middles = ((x, mpmath.mpf(float(m)) + mpmath.mpf(float(m - digits(float(m)))), r) for x, m, r in pairs)
+            return all(abs(x - m) <= r + mpmath.mpf(10) ** -25 for x, m, r in middles)
+
+        assert inside(step(), value[0])
+        for i in range(VARIABLES):
+            ahead, back = step((i, 1)), step((i, -1))
+            assert inside([(a - b) / (2 * h) for a, b in zip(ahead, back, strict=True)], slope[0, :, i])
+            j = (i + 3) % VARIABLES
+            corners = zip(
+                step((i, 1), (j, 1)), step((i, 1), (j, -1)), step((i, -1), (j, 1)), step((i, -1), (j, -1)), strict=True
+            )
+            assert inside([(a - b - c + d) / (4 * h * h) for a, b, c, d in corners], bend[0, :, i, j])
+    assert (value.r < 1e-3).all()
+    assert (bend.r < 1e-2).all()
+
+
+@pytest.fixture
+def short():
+    """The problem, the motion and the cost of a certified turn of 40 steps, whose goal has four active constraints."""
+    task, robot = make_task("turn"), named_robot("paper")
+    known = certified.load(task, robot)
+    return Problem(task, robot, tuple(known.constants[4].tolist())), known.trajectories[4], float(known.costs[4])
+
+
+def test_a_certified_turn_is_a_strict_local_minimum(short):
+    found = enclosed(*short)
+    assert found["radius"] < 1e-9
+    assert found["cost_width"] < 1e-9
+    assert found["active_constraints"] == 4
+
+
+def test_a_force_or_a_cost_that_differs_in_its_fifth_digit_is_refused(short):
+    problem, motion, cost = short
+    forces = motion.u.copy()
+    forces[np.unravel_index(np.abs(forces).argmax(), forces.shape)] *= 1 + 1e-4
+    with pytest.raises(NotProvenError, match="stored forces"):
+        enclosed(problem, replace(motion, u=forces), cost)
+    with pytest.raises(NotProvenError, match="certified"):
+        enclosed(problem, motion, cost * (1 + 1e-4))
+
+
+def test_a_motion_that_is_no_optimum_is_refused(short):
+    problem, motion, cost = short
+    with pytest.raises(ArithmeticError):
+        enclosed(problem, replace(motion, u=0.5 * motion.u), cost)
