@@ -306,7 +306,7 @@ def prove(problem: Problem, point: Point, linear: Linear) -> Minimum:
     parts = parts_of(problem, x, u, 2)
     multipliers = Ball.around(point.lam, (_times(np.abs(linear.p), box[0]) + box[2]) * _UP)
     inside = Point(x, u, multipliers, Ball.around(point.mu, box[3]), point.fixed, point.rows)
-    curvature = _Curvature(inside, parts, linear)
+    curvature = Curvature(inside, parts, linear)
     variation = curvature.variation(box)
     right = tuple(a + b * _UP for a, b in zip(at_point, variation, strict=True))
     image = inverse.bound(right, box)
@@ -323,7 +323,7 @@ def prove(problem: Problem, point: Point, linear: Linear) -> Minimum:
     )
 
 
-class _Curvature:
+class Curvature:
     """Second derivatives of the Lagrangian over a box."""
 
     def __init__(self, inside: Point, parts: Parts, linear: Linear):
@@ -430,7 +430,7 @@ def _check_constraints(problem: Problem, inside: Point, parts: Parts) -> None:
         raise NotProvenError("the goal may be reached earlier")
 
 
-def _cost(point: Point, thin: Parts, curvature: _Curvature, box: Box, forces: np.ndarray) -> tuple[float, float]:
+def _cost(point: Point, thin: Parts, curvature: Curvature, box: Box, forces: np.ndarray) -> tuple[float, float]:
     """Bounds of the cost of the minimum: the Lagrangian's value, slopes and curvature times the box."""
     value = thin.cost[0][:, 0] + (point.lam[1:] * (thin.step[0] - point.x[1:])) @ np.ones(8)
     total = sum((value[k] for k in range(1, len(value.m))), value[0])

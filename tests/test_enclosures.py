@@ -16,7 +16,8 @@ sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
 
 from enclosures import enclosed
 from intervals import VARIABLES, Ball, derivatives, variables
-from local_minimum import NotProvenError, Problem
+from local_minimum import Curvature, Linear, NotProvenError, Point, Problem, parts_of, residual
+from stationary import stationary
 
 DIGITS = 80
 
@@ -86,3 +87,45 @@ def test_a_motion_that_is_no_optimum_is_refused(short):
     problem, motion, cost = short
     with pytest.raises(ArithmeticError):
         enclosed(problem, replace(motion, u=0.5 * motion.u), cost)
+
+
+def test_the_conditions_change_as_the_linear_model_says_up_to_the_bound_of_the_theorem(short) -> None:
+    """F(z) − F(0) − Mz is the mean of (F' − M)z on the way to z, and F is nearly quadratic: half of the bound is reached."""
+    problem, motion, _ = short
+    point, m = stationary(problem, motion.x, motion.u)
+    rng, size = np.random.default_rng(0), 1e-6
+    box = tuple(np.full(part.shape, size) for part in (point.x, point.u, point.x, point.mu))
+    box[0][0] = 0.0
+    inside = moved(point, m, *(Ball(np.zeros(part.shape), part) for part in box))
+    bounds = Curvature(inside, parts_of(problem, inside.x, inside.u, 2), m).variation(box)
+    dx, v, w, nu = (part * rng.choice([-1, 1], part.shape) for part in box)
+    near = moved(point, m, dx, v, w, nu)
+    change = [
+        after.m - before.m
+        for after, before in zip(
+            *(residual(each, parts_of(problem, Ball(each.x), Ball(each.u), 1), m) for each in (near, point)),
+            strict=True,
+        )
+    ]
+    states = w - np.vstack([times(np.swapaxes(m.a, 1, 2), w[1:]), np.zeros((1, 8))])
+    linear = [dx[1:] - times(m.a, dx[:-1]) - times(m.b, v), v + times(m.gb, w[1:]), states, np.zeros(len(nu))]
+    for j, (k, _) in enumerate(point.rows):
+        linear[2][k] += m.slopes[j] * nu[j]
+        linear[3][j] = m.slopes[j] @ dx[k]
+    ratios = [np.max(np.abs(a - b)[1:] / c[1:]) for a, b, c in zip(change, linear, bounds, strict=True)]
+    assert max(ratios) == pytest.approx(0.5, abs=0.01)
+
+
+def times(matrices, vectors):
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def moved(point: Point, m: Linear, dx, v, w, nu) -> Point:
+    """The point at z = (dx, v, w, nu) of the theorem."""
+    return replace(
+        point,
+        x=point.x + dx,
+        u=point.u + (v - times(m.k, dx[:-1])),
+        lam=point.lam + (times(m.p, dx) + w),
+        mu=point.mu + nu,
+    )
