@@ -61,7 +61,8 @@ def main(
         out: folder of the results; an interrupted run continues here.
         workers: processes.
     """
-    jobs.claim(out, {"tasks": tasks, "robots": robots, "guesses": guesses, "episodes": episodes})
+    folder = jobs.RunFolder(out)
+    folder.claim({"tasks": tasks, "robots": robots, "guesses": guesses, "episodes": episodes})
     work = [
         jobs.Job(
             f"{robot}-{name}-{first:03d}",
@@ -79,7 +80,7 @@ def main(
     for robot in robots:
         for name in tasks:
             print(_line([row for row in rows if (row["robot"], row["task"]) == (robot, name)], guesses))
-    jobs.release(out)
+    folder.release()
 
 
 def _line(rows: Sequence[jobs.Entry], guesses: int) -> str:
