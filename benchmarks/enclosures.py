@@ -34,6 +34,7 @@ NEAR = 5e-6
 """Largest distance of a minimum from the stored forces: five times the reserve that the solvers keep from a goal."""
 SAME_COST = 1e-5
 """Largest difference between a stored cost and that of the minimum: what these reserves cost is less."""
+_BELOW = 1e-9  # by which a stored cost may be too low, from rounding and the tolerance of solvers
 _TOGETHER = 20  # episodes of a job
 _GUESSES = 200  # random ones, where the other searches do not come to the stored cost
 
@@ -57,7 +58,7 @@ def enclosed(problem: Problem, motion: Trajectory, cost: float, stored: bool = T
     if stored and not distance < NEAR:
         raise NotProvenError(f"the minimum is {distance:.2g} of the force limit away from the stored forces")
     above = cost - found.low
-    if not abs(above) < SAME_COST:
+    if not -_BELOW < above < SAME_COST:
         raise NotProvenError(f"the minimum costs {found.low:.9g}, and not the certified {cost:.9g}")
     return {
         "radius": float(found.radius.max()) / limit,
@@ -108,7 +109,8 @@ def _again(task: Task, robot: Robot, known: certified.EvaluationSet, i: int, fou
         x, u = optimum.trajectory.x, optimum.trajectory.u
         near = episode.solve_to_the_end(x, u / robot.force_limit, near=True)[-1]
         motion = Trajectory(optimum.trajectory.t, near.states, robot.force_limit * near.inputs)
-        if near.is_optimal and abs(near.cost - known.costs[i]) < SAME_COST:
+        same_length = len(u) == round(known.durations[i] / task.control_dt)
+        if near.is_optimal and same_length and abs(near.cost - known.costs[i]) < SAME_COST:
             break
     if motion is None:
         raise PlanError("no search found a motion")
