@@ -1,0 +1,125 @@
+"""Draws regret over training time, and prints the minutes to 5, 2 and 1 %: python docs/make_learning_curves.py [RUN ...]
+
+RUN is a folder of `ballbot train`. Its evaluations first go into experiments/learning-curves.csv and replace those of another
+run with the same task, learner and seed. The picture and the table show what that file holds.
+"""
+
+import csv
+import json
+import sys
+from collections import defaultdict
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ballbot_gym import files
+from ballbot_gym.tasks import TASKS
+from ballbot_train.report.labels import color, label
+from ballbot_train.work.console import markdown
+
+CURVES = Path(__file__).parent / "experiments" / "learning-curves.csv"
+PICTURE = Path(__file__).parent / "pictures" / "learning-curves.png"
+LEVELS = (0.05, 0.02, 0.01)
+_RUN = ("task", "learner", "seed")
+_COLUMNS = (*_RUN, "cpu_seconds", "regret_mean", "success")
+_RELIABLE = 0.99  # the mean regret of those that succeed says little where fewer do
+
+Row = dict[str, str]
+
+
+def read() -> list[Row]:
+    """Rows of the file, one for each evaluation."""
+    return list(csv.DictReader(CURVES.read_text(encoding="utf-8").splitlines())) if CURVES.exists() else []
+
+
+def add(folders: list[Path]) -> None:
+    """Puts the evaluations of these runs into the file."""
+    rows = read()
+    for folder in folders:
+        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        run = {name: str(config[name]) for name in _RUN}
+        rows = [row for row in rows if any(row[name] != run[name] for name in _RUN)]
+        found = csv.DictReader((folder / "evaluations.csv").read_text(encoding="utf-8").splitlines())
+        rows += [run | {"cpu_seconds": f"{float(row['cpu_seconds']):.0f}", **_shown(row)} for row in found]
+    rows.sort(key=lambda row: (list(TASKS).index(row["task"]), row["learner"], int(row["seed"])))
+    text = StringIO()
+    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    files.write(CURVES, text.getvalue())
+
+
+def _shown(row: Row) -> Row:
+    return {"regret_mean": f"{float(row['regret_mean']):.5f}", "success": row["success"]}
+
+
+def curves() -> dict[tuple[str, str], list[np.ndarray]]:
+    """For each task and learner the runs: seconds of processor time and mean regrets of reliable evaluations, (2, n)."""
+    runs: dict[tuple[str, str, str], list[tuple[float, float]]] = defaultdict(list)
+    for row in read():
+        evaluations = runs[row["task"], row["learner"], row["seed"]]
+        if float(row["success"]) >= _RELIABLE:
+            evaluations.append((float(row["cpu_seconds"]), float(row["regret_mean"])))
+    found = defaultdict(list)
+    for (task, learner, _), evaluations in runs.items():
+        found[task, learner].append(np.array(evaluations).reshape(-1, 2).T)
+    return found
+
+
+def table() -> str:
+    """Minutes of one core until the mean regret falls below each level: the median of the runs, and their range."""
+    rows = []
+    for (task, learner), runs in curves().items():
+        times = [[_first(run, level) for run in runs] for level in LEVELS]
+        rows.append([task.capitalize(), learner, str(len(runs)), *map(_minutes, times)])
+    return markdown(["task", "learner", "seeds", *(f"minutes to {level:.0%}" for level in LEVELS)], rows)
+
+
+def _first(run: np.ndarray, level: float) -> float:
+    """Seconds to the first evaluation below a level; infinity if there is none."""
+    below = run[0, run[1] < level]
+    return below[0] if len(below) else np.inf
+
+
+def _minutes(seconds: list[float]) -> str:
+    median, least, most = (value / 60 for value in (np.median(seconds), min(seconds), max(seconds)))
+    if np.isinf(median):
+        return "" if np.isinf(least) else f"in {np.isfinite(seconds).sum()} of {len(seconds)} runs"
+    if len(seconds) == 1:
+        return f"{median:.1f}"
+    return f"{median:.1f} ({least:.1f} to {'never' if np.isinf(most) else f'{most:.1f}'})"
+
+
+def picture() -> Figure:
+    """A panel for each task, a line for each run."""
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    panels = dict(zip(TASKS, figure.subplots(1, len(TASKS), sharey=True), strict=True))
+    for (task, learner), runs in curves().items():
+        for k, (seconds, regrets) in enumerate(runs):
+            name = "" if k else label(learner)
+            panels[task].plot(seconds / 60, 100 * regrets, ".-", ms=3, lw=1.2, color=color(learner), label=name)
+    for task, axis in panels.items():
+        axis.set(title=task.capitalize(), xlabel="minutes of one core", xscale="log", yscale="log")
+        axis.set(xlim=(0.5, 60), xticks=[1, 3, 10, 30], ylim=(0.5, 50), yticks=[1, 2, 5, 10, 20])
+        axis.minorticks_off()
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_major_formatter("{x:g} %")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    next(iter(panels.values())).set_ylabel("mean regret")
+    return figure
+
+
+def main(folders: list[str]) -> None:
+    """Adds these runs, draws the picture and prints the table."""
+    if folders:
+        add([Path(folder) for folder in folders])
+    picture().savefig(PICTURE, dpi=110)
+    print(table(), end="")
+    print(PICTURE.relative_to(Path.cwd()) if PICTURE.is_relative_to(Path.cwd()) else PICTURE)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
