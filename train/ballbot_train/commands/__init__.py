@@ -11,7 +11,7 @@ GROUPS = {
     "measure": ("benchmark", "evaluate", "compare", "robustness", "transfer", "basins", "submit", "verify"),
     "look": ("play", "page", "replay", "optimize", "paper"),
     "train": ("train", "demos"),
-    "make": ("new", "certify", "export"),
+    "make": ("new", "identify", "certify", "export"),
 }
 """The commands by what they are for, in the order of `ballbot --help`."""
 

@@ -1,0 +1,1 @@
+"""From a log of a robot to its numbers."""

@@ -1,0 +1,335 @@
+"""The numbers of a robot that make a log most likely, with intervals, and what the log cannot tell.
+
+Every parameter has a prior: the nominal robot, with the spread that drawings and data sheets usually have. In units z of
+these spreads, with z = 0 for the nominal robot, the estimate minimizes
+
+    ½ |z|² − log-likelihood(z),
+
+where the likelihood is that of `likelihood`. Its second derivative is I + H with the Fisher information H of the log, and
+the inverse of that is the covariance of z. If an eigenvalue of H is far above 1, the log tells the combination of parameters
+that is its eigenvector. If an eigenvalue is below 1, the log tells less than the prior, and the combination stays near that
+of the nominal robot.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import scipy.optimize
+
+from ballbot_baselines.identification.likelihood import Innovations, Lanes, Readings, innovations, numbers_of
+from ballbot_gym.robot import Ballbot
+
+_SPREADS = {
+    "body_mass": 0.3, "ball_mass": 0.2, "com_height": 0.2, "inertia": 0.3, "axial_inertia": 0.3, "force_limit": 0.2,
+    "wheels.no_load_speed": 0.2, "wheels.inertia": 0.4, "wheels.damping": 0.7, "wheels.spin_friction": 0.7,
+}  # fmt: skip
+"""Standard deviation of the logarithm of a robot's number: 0.2 is about 20 %."""
+_DELAY, _LAG, _LAG_SPREAD = 0.03, 0.004, 1.2  # s, s, and of the logarithm
+_BIASES = {"lean": 0.03, "lean_rate": 0.02, "gyro": 0.02, "accel": 0.2}  # rad, rad/s, rad/s, m/s²
+_NOISES = {
+    "position": 0.005, "lean": 0.005, "speed": 0.03, "lean_rate": 0.02, "heading": 0.01, "heading_rate": 0.02,
+    "ball_spin": 0.05, "gyro": 0.01, "accel": 0.1, "wheel_speed": 0.1, "wheel_angle": 0.002,
+}  # fmt: skip
+"""Standard deviation of a reading's noise, SI units, from which the estimate starts."""
+_DRIFTS = {"speed drift": 0.05, "lean rate drift": 0.05}  # m/s and rad/s in a second
+_LEAST_DRIFT = 1e-3  # the same: no robot follows equations better
+_NOISE_SPREAD = 2.0  # of the logarithm of noises and drifts: next to nothing is known before
+_OUTLIER = 5.0  # deviations: one in two million readings is this far by chance
+_DIFFERENCE = 0.01  # of z, for derivatives
+_ROUNDS = 60
+_NEAR = 1e-3  # the squared distance to the minimum, in standard deviations of the estimate, at which the search ends
+_TOLD = 0.25  # the log tells a parameter if it narrows the prior's interval to this share
+_WITHIN_95 = 1.96
+
+
+class Parameter(NamedTuple):
+    """What is estimated."""
+
+    name: str
+    unit: str
+    nominal: float
+    spread: float
+    """Standard deviation of the prior: of the logarithm for a positive number, else in its unit."""
+    positive: bool
+
+    def value(self, z: Any) -> Any:
+        """The value for z spreads away from the nominal one."""
+        return self.nominal * np.exp(self.spread * z) if self.positive else self.nominal + self.spread * z
+
+
+class Estimate(NamedTuple):
+    """A parameter as a log tells it."""
+
+    parameter: Parameter
+    value: float
+    low: float
+    high: float
+    """The 95 % interval, of log and prior together."""
+    told: bool
+    """Whether the log tells it, and not the prior alone."""
+
+
+class Direction(NamedTuple):
+    """A combination of parameters, with what the log tells of it compared with the prior."""
+
+    eigenvalue: float
+    shares: dict[str, float]
+    """Of each parameter in spreads, the largest of them."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is estimated from logs.
+
+    | field | meaning |
+    |---|---|
+    | robot | the nominal robot |
+    | names | of the readings |
+    | known | names of parameters that are held at their nominal values |
+    """
+
+    robot: Ballbot
+    names: tuple[str, ...]
+    known: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        every = [each.name for each in self._all_parameters()]
+        if unknown := [name for name in self.known if name not in every]:
+            raise ValueError(f"unknown parameter {unknown[0]!r}; known: {', '.join(map(repr, every))}")
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All that are estimated."""
+        return tuple(each for each in self._all_parameters() if each.name not in self.known)
+
+    def _all_parameters(self) -> list[Parameter]:
+        robot = [
+            Parameter(name, _UNITS[name], attrgetter(name)(self.robot), spread, positive=True)
+            for name, spread in _SPREADS.items()
+            if (name in _UNITS and not name.startswith("wheels.")) or self.robot.wheel_radius
+        ]
+        drive = [
+            Parameter("delay", "s", 0.0, _DELAY, positive=False),
+            Parameter("lag", "s", _LAG, _LAG_SPREAD, positive=True),
+        ]
+        biases = [
+            Parameter(f"{name} bias", "", 0.0, _BIASES[group_of(name)], positive=False)
+            for name in self.names
+            if group_of(name) in _BIASES
+        ]
+        noises = [
+            Parameter(f"{name} noise", "", _NOISES[name], _NOISE_SPREAD, positive=True)
+            for name in dict.fromkeys(map(group_of, self.names))
+        ]
+        drifts = [Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in _DRIFTS.items()]
+        return [each for each in [*robot, *drive, *biases, *noises, *drifts] if each.nominal > 0 or not each.positive]
+
+    def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Values (B,) by name, of lanes z (B, p); those that are known too."""
+        held = {
+            each.name: np.full(len(z), 0.0 if each.name == "lag" else each.nominal) for each in self._all_parameters()
+        }
+        return held | {each.name: each.value(z[:, i]) for i, each in enumerate(self.parameters)}
+
+    def robot_of(self, values: dict[str, Any]) -> Ballbot:
+        """The robot with values by name. If the values are (B,), so are its numbers."""
+        own = {name: values[name] for name in _SPREADS if name in values and "." not in name}
+        if (inertia := getattr(self.robot, "ball_inertia", None)) is not None:
+            own["ball_inertia"] = inertia * (own["ball_mass"] / self.robot.ball_mass)
+        if wheels := {name.partition(".")[2]: values[name] for name in _SPREADS if name in values and "." in name}:
+            own["wheels"] = replace(cast(Any, self.robot).wheels, **wheels)
+        return replace(self.robot, **own)
+
+    def z_of(self, robot: Ballbot, delay: float, like: np.ndarray) -> np.ndarray:
+        """(p,) of another robot of the same kind, s of delay, and sensors as in `like` (p,)."""
+        z = like.copy()
+        for i, each in enumerate(self.parameters):
+            if each.name in _SPREADS:
+                z[i] = np.log(attrgetter(each.name)(robot) / each.nominal) / each.spread
+            elif each.name == "delay":
+                z[i] = (delay - each.nominal) / each.spread
+        return z
+
+    def lanes(self, z: np.ndarray) -> Lanes:
+        """The lanes of z (B, p)."""
+        values = self.values(z)
+        numbers = np.stack([np.broadcast_to(number, len(z)) for number in numbers_of(self.robot_of(values))], axis=1)
+        none = np.zeros(len(z))
+        return Lanes(
+            numbers,
+            values["force_limit"] / self.robot.force_limit,
+            values["delay"],
+            values["lag"],
+            np.stack([values.get(f"{name} bias", none) for name in self.names], axis=1),
+            np.stack([values[f"{group_of(name)} noise"] for name in self.names], axis=1),
+            np.stack([np.hypot(values[name], _LEAST_DRIFT) for name in _DRIFTS], axis=1),
+        )
+
+
+_UNITS = {
+    "body_mass": "kg", "ball_mass": "kg", "com_height": "m", "inertia": "kg·m²", "axial_inertia": "kg·m²",
+    "force_limit": "N", "wheels.no_load_speed": "rad/s", "wheels.inertia": "kg·m²", "wheels.damping": "N·m·s",
+    "wheels.spin_friction": "N·m",
+}  # fmt: skip
+
+
+def group_of(name: str) -> str:
+    """The kind of a quantity, whose sensors have one noise: "lean" of "lean_x"."""
+    return name[:-2]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a log told.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | problem | | what was asked |
+    | z | (p,) | the estimate in spreads |
+    | information | (p, p) | H, of the log alone, in spreads |
+    | rounds | | how often the likelihood was computed |
+    | outliers | | readings that were left out because their innovations are too large to be noise |
+    """
+
+    problem: Problem
+    z: np.ndarray
+    information: np.ndarray
+    rounds: int
+    outliers: int = 0
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(p, p) of z, from log and prior."""
+        return np.linalg.inv(self.information + np.eye(len(self.z)))
+
+    @property
+    def robot(self) -> Ballbot:
+        """The estimated robot."""
+        return self.problem.robot_of(
+            {name: float(value[0]) for name, value in self.problem.values(self.z[None]).items()}
+        )
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Every parameter with its interval."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        return [
+            Estimate(
+                each,
+                *(float(each.value(z + step * deviation)) for step in (0.0, -_WITHIN_95, _WITHIN_95)),
+                told=bool(deviation < _TOLD),
+            )
+            for each, z, deviation in zip(self.problem.parameters, self.z, deviations, strict=True)
+        ]
+
+    @property
+    def directions(self) -> list[Direction]:
+        """The combinations of parameters of which the log tells less than the prior, the least first."""
+        eigenvalues, vectors = np.linalg.eigh(self.information)
+        names = [each.name for each in self.problem.parameters]
+        found = []
+        for value, vector in zip(eigenvalues, vectors.T, strict=True):
+            if value < 1:
+                vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+                order = np.argsort(-np.abs(vector))
+                shares = {names[i]: float(vector[i]) for i in order if abs(vector[i]) > 0.25}
+                found.append(Direction(float(max(value, 0.0)), shares))
+        return found
+
+
+def most_likely(problem: Problem, logs: list[Readings], watch: Callable[[int], object] = lambda done: None) -> Found:
+    """The most likely parameters of logs with the same readings.
+
+    Readings whose innovations are too large to be noise are left out, and the estimate is repeated from where it was.
+
+    Args:
+        problem: what is estimated.
+        logs: one or more of them.
+        watch: called with the number of times that the likelihood was computed.
+
+    Raises:
+        ValueError: the logs are so far from what the robot can do that the filter fails.
+    """
+    z, _, rounds = _minimum(problem, logs, np.zeros(len(problem.parameters)), watch, 0)
+    kept, outliers = zip(*[_without_outliers(problem, log, z) for log in logs], strict=True)
+    z, found, rounds = _minimum(problem, list(kept), z, watch, rounds)
+    return Found(problem, z, found, rounds, sum(outliers))
+
+
+def _minimum(
+    problem: Problem, logs: list[Readings], start: np.ndarray, watch: Callable[[int], object], rounds: int
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """z (p,) and H (p, p) at the minimum, and how often the likelihood was computed in all."""
+    known: dict[bytes, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def at(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        key = z.tobytes()
+        if key not in known:
+            value, slope, curvature = information(problem, logs, z)
+            known[key] = value + 0.5 * float(z @ z), slope + z, curvature + np.eye(len(z))
+            watch(rounds + len(known))
+        return known[key]
+
+    def end_near(z: np.ndarray) -> None:
+        _, slope, curvature = at(z)
+        if slope @ np.linalg.solve(curvature, slope) < _NEAR:
+            raise StopIteration
+
+    if not np.isfinite(at(start)[0]):
+        raise ValueError(
+            "the filter of the nominal robot cannot follow this log; is it of this robot, with these columns?"
+        )
+    found = scipy.optimize.minimize(
+        lambda z: at(z)[0], start, jac=lambda z: at(z)[1], hess=lambda z: at(z)[2], method="trust-exact",
+        options={"maxiter": _ROUNDS, "gtol": 0.0, "initial_trust_radius": 2.0, "max_trust_radius": 10.0},
+        callback=end_near,
+    )  # fmt: skip
+    return found.x, at(found.x)[2] - np.eye(len(start)), rounds + len(known)
+
+
+def _without_outliers(problem: Problem, log: Readings, z: np.ndarray) -> tuple[Readings, int]:
+    """A log without readings that are too far from what the robot z (p,) predicts, and how many those are."""
+    found = innovations(problem.robot, log, problem.lanes(z[None]))
+    far = found.missed[:, 0] ** 2 > _OUTLIER**2 * found.variance[:, 0]
+    return replace(log, y=np.where(far, np.nan, log.y)), int(far.sum())
+
+
+def information(problem: Problem, logs: list[Readings], z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The negative log-likelihood of logs at z (p,), its slope (p,), and their Fisher information (p, p).
+
+    With the innovations ν and their variances S of all readings, H = Σ ν' ν'ᵀ / S + ½ S' S'ᵀ / S². The derivatives ν' and
+    S' are central differences.
+    """
+    count = len(z)
+    around = z + _DIFFERENCE * np.vstack([np.zeros((1, count)), np.eye(count), -np.eye(count)])
+    value, slope, curvature = 0.0, np.zeros(count), np.zeros((count, count))
+    for log in logs:
+        with np.errstate(all="ignore"):  # of filters that fail
+            found = innovations(problem.robot, log, problem.lanes(around))
+        missed, variance, moved, widened = _differences(found, count)
+        scale = 1 / np.sqrt(variance)
+        first, second = moved * scale[:, None], widened / variance[:, None]
+        value += 0.5 * float(np.sum(np.log(variance) + missed**2 / variance))
+        slope += np.einsum("npm,nm->p", first, missed * scale)
+        slope += 0.5 * np.einsum("npm,nm->p", second, 1 - missed**2 / variance)
+        for weight, part in ((1.0, first), (0.5, second)):
+            flat = part.transpose(1, 0, 2).reshape(count, -1)
+            curvature += weight * flat @ flat.T
+    if not (np.isfinite(value) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
+        return np.inf, np.zeros(count), np.eye(count)
+    return value, slope, curvature
+
+
+def _differences(found: Innovations, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """ν and S (n, m) of the first lane, and their derivatives (n, p, m) from those around it."""
+    apart = 2 * _DIFFERENCE
+    up, down = slice(1, 1 + count), slice(1 + count, None)
+    return (
+        found.missed[:, 0],
+        found.variance[:, 0],
+        (found.missed[:, up] - found.missed[:, down]) / apart,
+        (found.variance[:, up] - found.variance[:, down]) / apart,
+    )

@@ -1,0 +1,320 @@
+"""How likely a log is for many robots at once, by an extended Kalman filter for each.
+
+The filter's state is that of the robot, and the angles of the wheels where the log has them. Readings are
+
+    y_i = h_i(x, u) + bias_i + noise_i,
+
+with independent noise, so the filter takes the readings of one time one by one, and no matrix is inverted. What the equations
+of motion do not explain is white noise on the speeds. For every reading the filter gives the innovation ν, which is the
+reading less its prediction from all earlier readings, and the variance S that it expects of ν. The log-likelihood of the log
+is −½ Σ (ln 2πS + ν²/S).
+
+A *lane* is one set of numbers for robot, drive and sensors. All lanes are computed together, in machine code where a compiler
+is installed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi
+import numpy as np
+
+from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
+from ballbot_gym.robot import Ballbot, Kind
+
+_STATES = {
+    "position_x": "m", "position_y": "m", "lean_x": "rad", "lean_y": "rad",
+    "speed_x": "m/s", "speed_y": "m/s", "lean_rate_x": "rad/s", "lean_rate_y": "rad/s",
+    "heading": "rad", "heading_rate": "rad/s", "ball_spin": "rad/s",
+}  # fmt: skip
+_READINGS = {
+    "gyro_x": "rad/s", "gyro_y": "rad/s", "gyro_z": "rad/s", "accel_x": "m/s²", "accel_y": "m/s²", "accel_z": "m/s²",
+    "wheel_speed_1": "rad/s", "wheel_speed_2": "rad/s", "wheel_speed_3": "rad/s",
+}  # fmt: skip
+_ANGLES = {"wheel_angle_1": "rad", "wheel_angle_2": "rad", "wheel_angle_3": "rad"}
+QUANTITIES = _STATES | _READINGS | _ANGLES
+"""Every quantity that a log may have, with its unit."""
+COMMANDS = {2: ("command_x", "command_y"), 3: ("command_1", "command_2", "command_3")}
+"""Names of the commands of robots with so many actuators."""
+_POSES = {0, 1, 2, 3, 8}  # components of a state without noise of their own: their rates have it
+_START = np.array([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.5, 0.5, 0.1, 0.5, 0.5])
+"""Standard deviation of each component of a state that is not read, before the first reading, SI units."""
+_MANY = 8000  # operations of a function on which the compiler would spend minutes with all optimizations
+
+
+def readable(robot: Ballbot) -> dict[str, str]:
+    """The quantities that a log of a robot may have, by name, with their units.
+
+    `lean_x` is γ and `lean_y` is θ, so a positive lean is towards positive x or y. `gyro` and `accel` are in the body's
+    axes at its centre of mass, as `ballbot_gym.robot.sensors` describes them; they and the wheels are for robots with wheels.
+    """
+    states = dict(list(_STATES.items())[: robot.state_size])
+    return states | (_READINGS | _ANGLES if robot.SENSORS else {})
+
+
+def commanded(robot: Ballbot) -> tuple[str, ...]:
+    """Names of the commands of a robot: of the force on the ball along x and y, or of each wheel."""
+    return COMMANDS[robot.action_size]
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What a log holds, in SI units, on its clock.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | names | m | what is read, see `readable` |
+    | t | (n,) | s, growing |
+    | y | (n, m) | readings; NaN where there is none |
+    | commands | (n, k) | in units of the robot's action, each from its time until the next |
+    | delays | m | s, by which readings are about an earlier time than theirs; () for none |
+    | restarts | | indices of the first readings after gaps |
+    """
+
+    names: tuple[str, ...]
+    t: np.ndarray
+    y: np.ndarray
+    commands: np.ndarray
+    delays: tuple[float, ...] = ()
+    restarts: tuple[int, ...] = ()
+
+    def between(self, first: int, last: int) -> "Readings":
+        """The readings from index `first` until before `last`."""
+        cut, restarts = slice(first, last), tuple(i - first for i in self.restarts if first < i < last)
+        return Readings(self.names, self.t[cut], self.y[cut], self.commands[cut], self.delays, restarts)
+
+    @property
+    def dt(self) -> float:
+        """The median time between two readings, s."""
+        return float(np.median(np.diff(self.t)))
+
+
+class Lanes(NamedTuple):
+    """B sets of numbers."""
+
+    numbers: np.ndarray
+    """(B, ...) of the robots, see `numbers_of`."""
+    strength: np.ndarray
+    """(B,) ratio of the applied force to the command."""
+    delay: np.ndarray
+    """(B,) s, by which the force follows the command later than the readings do."""
+    lag: np.ndarray
+    """(B,) s, time constant of the force."""
+    bias: np.ndarray
+    """(B, m) of the readings."""
+    noise: np.ndarray
+    """(B, m) standard deviation of the readings' noise."""
+    drift: np.ndarray
+    """(B, 2) standard deviation of what is added to speeds and to turning rates in a second, m/s and rad/s."""
+
+
+class Innovations(NamedTuple):
+    """What the filters of B lanes found."""
+
+    missed: np.ndarray
+    """(n, B, m) ν; 0 where there is no reading."""
+    variance: np.ndarray
+    """(n, B, m) S; 1 where there is no reading."""
+    states: np.ndarray
+    """(n, B, s) the states, after the readings of their time."""
+
+    def log_likelihood(self) -> np.ndarray:
+        """(B,), without the constant −½ ln 2π for each reading."""
+        return -0.5 * np.sum(np.log(self.variance) + self.missed**2 / self.variance, axis=(0, 2))
+
+
+def numbers_of(robot: Ballbot) -> list[float]:
+    """The numbers of a robot that filters compute with."""
+    return [*robot.numbers(), *(getattr(robot, name) for name in robot.SENSORS)]
+
+
+def applied(readings: Readings, lanes: Lanes) -> np.ndarray:
+    """(n, B, k) the force that B lanes apply from each time of a log to the next.
+
+    It is the mean of the delayed command over that time, followed with a first-order lag as `Randomization.actuate` has it.
+    """
+    t, commands = readings.t, readings.commands
+    ends = np.append(t, t[-1] + readings.dt)
+    total = np.concatenate([np.zeros((1, commands.shape[1])), np.cumsum(commands * np.diff(ends)[:, None], axis=0)])
+    before = ends[:, None] - lanes.delay  # (n + 1, B)
+    sums = np.stack([np.interp(before, ends, column) for column in total.T], axis=-1)
+    early = np.minimum(before - ends[0], 0.0)[..., None] * commands[0]  # the first command is taken for those before
+    late = np.maximum(before - ends[-1], 0.0)[..., None] * commands[-1]
+    forces = np.diff(sums + early + late, axis=0) / np.diff(ends)[:, None, None]
+    share = 1 - np.exp(-np.diff(ends)[:, None] / np.maximum(lanes.lag, 1e-9))
+    for i in range(1, len(forces)):
+        forces[i] = forces[i - 1] + share[i][:, None] * (forces[i] - forces[i - 1])
+    return forces * lanes.strength[:, None]
+
+
+def innovations(robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.ndarray | None = None) -> Innovations:
+    """Runs the filters of B lanes over a log.
+
+    Args:
+        robot: of the lanes' kind.
+        readings: of n times.
+        lanes: B of them.
+        factors: (B, m + k) on the readings and the commands; default, 1.
+    """
+    n, lane_count, m = len(readings.t), len(lanes.delay), len(readings.names)
+    step, size = _step(robot.kind, readings.names, readings.delays or (0.0,) * m, robot.substeps(readings.dt))
+    packed = size + size * (size + 1) // 2
+    calls = -(-lane_count // LANES)
+    count = calls * LANES
+    factors = np.ones((lane_count, m + readings.commands.shape[1])) if factors is None else factors
+    forces, y = applied(readings, lanes) * factors[:, m:], readings.y[:, None, :] * factors[:, :m]
+    used = np.isfinite(readings.y)
+    steps = np.zeros((n, count, 2 * m + 2 * forces.shape[2] + 1))
+    steps[:, :lane_count] = np.concatenate(
+        [
+            np.where(used[:, None, :], y, 0.0),
+            np.broadcast_to(used[:, None, :], y.shape),
+            np.concatenate([forces[:1], forces[:-1]]),
+            forces,
+            np.broadcast_to(
+                np.diff(readings.t, append=readings.t[-1] + readings.dt)[:, None, None], (n, lane_count, 1)
+            ),
+        ],
+        axis=-1,
+    )
+    constants = np.zeros((count, lanes.numbers.shape[1] + 2 * m + 2))
+    constants[:lane_count] = np.hstack([lanes.numbers, lanes.bias, lanes.noise**2, lanes.drift**2])
+    constants[lane_count:], steps[:, lane_count:] = constants[:1], steps[:, :1]  # what fills the last call
+    now, found = np.zeros_like(steps[0]), np.zeros((count, 2 * m + size))
+    pair = np.zeros((count, packed)), np.zeros((count, packed))
+    run = [InPlace(step.map(calls), [a, constants, now], [b, found]) for a, b in (pair, pair[::-1])]
+    every = np.empty((n, lane_count, 2 * m + size))
+    restarts = {0, *readings.restarts}
+    for i in range(n):
+        if i in restarts:
+            pair[i % 2][:] = _starts(readings, i, y[i], size, count)
+        now[:] = steps[i]
+        run[i % 2]()
+        every[i] = found[:lane_count]
+    return Innovations(every[..., :m], every[..., m : 2 * m], every[..., 2 * m :])
+
+
+def _starts(readings: Readings, i: int, y: np.ndarray, size: int, count: int) -> np.ndarray:
+    """(count, ...) states and packed covariances of filters that begin at index i, whose readings are y (B, m)."""
+    x, spread = np.zeros((count, size)), np.full(size, 0.1)
+    spread[: min(size, len(_START))] = _START[:size]
+    places = _places(readings.names, size)
+    for j, name in enumerate(readings.names):
+        if name in places and np.isfinite(readings.y[i, j]):
+            x[: len(y), places[name]], x[len(y) :, places[name]] = y[:, j], y[0, j]
+    upper = np.diag(spread**2)[np.triu_indices(size)]
+    return np.hstack([x, np.broadcast_to(upper, (count, len(upper)))])
+
+
+def _places(names: tuple[str, ...], size: int) -> dict[str, int]:
+    """Components of the filter's state that are read directly."""
+    angles = _angles(names)
+    states = list(_STATES)[: size - len(angles)]
+    return {name: i for i, name in enumerate([*states, *angles])}
+
+
+def _angles(names: tuple[str, ...]) -> list[str]:
+    return [name for name in _ANGLES if name in names]
+
+
+def rates_with_angles(robot: Any, names: tuple[str, ...]) -> Callable[[Any, Any], tuple[Any, ...]]:
+    """The equations of motion of a filter's state, (x, u) -> ẋ: those of the robot, and of wheels whose angles are read."""
+    states, angles = len(robot.STATE), _angles(names)
+
+    def rates(x: tuple[Any, ...], u: tuple[Any, ...]) -> tuple[Any, ...]:
+        speeds = robot.readings(x[:states], u)[6:] if angles else ()
+        return (*robot.derivative(x[:states], u), *(speeds[int(name[-1]) - 1] for name in angles))
+
+    return rates
+
+
+def expected_readings(robot: Any, names: tuple[str, ...], x: tuple[Any, ...], u: tuple[Any, ...]) -> list[Any]:
+    """What perfect sensors without a bias read in a filter's state x under u."""
+    places, sensed = _places(names, len(x)), {}
+    if set(names) & set(_READINGS):
+        sensed = dict(zip(_READINGS, robot.readings(x[: len(robot.STATE)], u), strict=True))
+    return [sensed[name] if name in sensed else x[places[name]] for name in names]
+
+
+@lru_cache(maxsize=8)
+def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substeps: int) -> tuple[casadi.Function, int]:
+    """A step of `LANES` filters, and the size of their state.
+
+    (state and packed covariance before the readings; constants; readings, forces before and after, and the time until the
+    next readings, s) -> (state and packed covariance before the next readings; innovations, their variances, and the state)
+    """
+    symbol, robot = casadi.SX.sym, kind.robot
+    states, actions, m = len(robot.STATE), len(robot.ACTION), len(names)
+    size, count = states + len(_angles(names)), len(kind.numbers) + len(robot.SENSORS)
+    held, constants = symbol("held", size + size * (size + 1) // 2), symbol("constants", count + 2 * m + 2)
+    step = symbol("step", 2 * m + 2 * actions + 1)
+    numbers, bias, variance, drift = _split(constants, count, m, m, 2)
+    y, used, before, u, dt = _split(step, m, m, actions, actions, 1)
+    model: Any = kind.model(numbers[: len(kind.numbers)])
+    for name, number in zip(robot.SENSORS, numbers[len(kind.numbers) :], strict=True):
+        object.__setattr__(model, name, number)
+
+    rates, x = rates_with_angles(model, names), held[:size]
+    backwards = casadi.vertcat(*rates(_tuple(x), before))
+    earlier = {delay: expected_readings(model, names, _tuple(x - delay * backwards), before) for delay in set(delays)}
+    expected = casadi.vertcat(*[earlier[delay][i] for i, delay in enumerate(delays)])
+    z, p, missed, expected_variance = _corrected(
+        x, _unpacked(held[size:], size), (expected, casadi.jacobian(expected, x)), (y, used, bias, variance)
+    )
+    own = _tuple(symbol("x", size))
+    slope = casadi.substitute(
+        casadi.jacobian(casadi.vertcat(*rates(own, u)), casadi.vertcat(*own)), casadi.vertcat(*own), z
+    )
+    moved = dt[0] * slope
+    transition = casadi.SX.eye(size) + moved + moved @ moved / 2
+    speeds = [0.0 if i in _POSES or i >= states else drift[0] if i in (4, 5) else drift[1] for i in range(size)]
+    p = transition @ p @ transition.T + dt[0] * casadi.diag(casadi.vertcat(*speeds))
+    after = model.step(_tuple(z), u, dt[0], substeps, rates)
+    packed = casadi.vertcat(*after, *(p[i, j] for i in range(size) for j in range(i, size)))
+    outputs = [packed, casadi.vertcat(*missed, *expected_variance, z)]
+    function = casadi.Function(
+        "filter", [held, constants, step], [casadi.densify(each) for each in outputs], {"cse": True}
+    )
+    flags = LONG if function.n_instructions() > _MANY else SIMD
+    return in_lanes("identify", (function,), flags)[0], size
+
+
+def _corrected(
+    x: Any, p: Any, expected: tuple[Any, Any], read: tuple[Any, ...]
+) -> tuple[Any, Any, list[Any], list[Any]]:
+    """The state and covariance after readings one by one, whose `expected` values have a Jacobian; ν and S of each."""
+    (value, slopes), (y, used, bias, variance) = expected, read
+    z, missed, variances = x, [], []
+    for i in range(slopes.shape[0]):
+        across = p @ slopes[i, :].T
+        spread = slopes[i, :] @ across + variance[i]
+        error = used[i] * (y[i] - bias[i] - value[i] - slopes[i, :] @ (z - x))
+        missed.append(error)
+        variances.append(used[i] * spread + (1 - used[i]))
+        z = z + across * error / spread
+        p = p - used[i] / spread * across @ across.T
+    return z, p, missed, variances
+
+
+def _split(column: Any, *sizes: int) -> list[tuple[Any, ...]]:
+    parts, first = [], 0
+    for size in sizes:
+        parts.append(_tuple(column[first : first + size]))
+        first += size
+    return parts
+
+
+def _tuple(column: Any) -> tuple[Any, ...]:
+    return tuple(casadi.vertsplit(column))
+
+
+def _unpacked(upper: Any, size: int) -> Any:
+    """The symmetric matrix of an upper triangle by rows."""
+    rows, at = [[upper[0]] * size for _ in range(size)], 0
+    for i in range(size):
+        for j in range(i, size):
+            rows[i][j] = rows[j][i] = upper[at]
+            at += 1
+    return casadi.vertcat(*[casadi.horzcat(*row) for row in rows])

@@ -1,0 +1,163 @@
+"""Logs of simulated robots: what a robot with sensors, delay and motors would have recorded."""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ballbot_baselines.feedback.adaptive import FilteredController
+from ballbot_baselines.feedback.lqr import LqrController
+from ballbot_baselines.identification.likelihood import Readings, readable
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.robot import Ballbot, Randomization, Sensors
+from ballbot_gym.rollout import Controller, rollout
+from ballbot_gym.tasks import Task
+
+Motion = Callable[[float], np.ndarray]
+"""(3,) place, m, and heading, rad, at which the robot is asked to be at a time, s; only robots with wheels have a heading."""
+
+RATE = 100.0
+"""Readings per second of a recorded log."""
+_STATES = tuple(f"{name}_{axis}" for name in ("position", "lean", "speed", "lean_rate") for axis in "xy")
+_BEGIN = 2.0  # s, in which a motion grows to its whole size
+_TURN = 0.15  # rad, of each wave of the heading
+_STEP = 1e-3  # s, of the difference that gives a motion's speed
+
+
+class Recorded(NamedTuple):
+    """A log, and what made it."""
+
+    readings: Readings
+    robot: Ballbot
+    """With the masses and lengths that were drawn."""
+    strength: float
+    """Ratio of the applied force to the command."""
+    delay: float
+    """s."""
+
+
+def still(t: float) -> np.ndarray:
+    """The motion of a robot that balances in one place."""
+    return np.zeros(3)
+
+
+class Waves(NamedTuple):
+    """A motion of sines."""
+
+    amplitudes: np.ndarray
+    """(3, k) m, m and rad."""
+    frequencies: np.ndarray
+    """(k,) Hz."""
+    phases: np.ndarray
+    """(3, k) rad."""
+
+    def __call__(self, t: float) -> np.ndarray:
+        waves = self.amplitudes * np.sin(2 * math.pi * self.frequencies * t + self.phases)
+        return min(t / _BEGIN, 1.0) * waves.sum(axis=1)
+
+
+def driving(robot: Ballbot, rng: np.random.Generator) -> Waves:
+    """A motion of five waves of random phase, with leans of up to about ten degrees and half the force of the drive."""
+    frequencies = np.array([0.07, 0.16, 0.31, 0.53, 0.87])
+    most = min(1.0, 0.25 * robot.FORCE_SHARE * robot.force_limit / robot.total_mass)  # m/s², of all waves together
+    acceleration = most / math.sqrt(len(frequencies)) * np.array([0.3, 0.8, 1.0, 1.0, 1.0])
+    along = acceleration / (2 * math.pi * frequencies) ** 2
+    amplitudes = np.minimum([along, along, np.full(len(along), _TURN)], 2.0)
+    return Waves(amplitudes, frequencies, rng.uniform(0, 2 * math.pi, amplitudes.shape))
+
+
+class _Driver:
+    """A controller that holds the robot in a moving place, and writes down what it asks for."""
+
+    def __init__(self, controller: Controller, motion: Motion):
+        self._controller, self._motion = controller, motion
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._controller.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        place = self._motion(t)
+        speed = (self._motion(t + _STEP) - place) / _STEP
+        moved = np.array(x, np.float64)
+        moved[:2], moved[4:6] = x[:2] - place[:2], x[4:6] - speed[:2]
+        if len(x) > len(_STATES):
+            moved[8:10] = x[8] - place[2], x[9] - speed[2]
+        return self._controller.act(t, moved)
+
+
+class _Logger:
+    """Passes everything on to a controller, and keeps what it was shown and what it answered."""
+
+    def __init__(self, controller: Any):
+        self._controller = controller
+        self.senses = getattr(controller, "senses", False)
+        self.seen: list[np.ndarray] = []
+        self.commands: list[np.ndarray] = []
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._controller.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        self.seen.append(np.array(x, np.float64))
+        self.commands.append(np.array(self._controller.act(t, x), np.float64))
+        return self.commands[-1]
+
+
+def record(
+    robot: Ballbot,
+    seconds: float = 60.0,
+    motion: Motion | None = None,
+    randomization: Randomization | str | None = "real",
+    physics: str | None = None,
+    seed: int = 0,
+) -> Recorded:
+    """Records a robot that LQR balances behind a filter; the controller is made for the nominal robot.
+
+    Robots without wheels report their state with the errors of the randomization. Robots with wheels report gyroscope,
+    accelerometer and the angles of their wheels, with the errors of `ballbot_gym.robot.sensors`.
+
+    Args:
+        robot: the nominal one.
+        seconds: of the log.
+        motion: where it is asked to be; default, `driving`.
+        randomization: what differs from the nominal robot, or a name in `TRACKS`.
+        physics: same as in `BallbotEnv`.
+        seed: of what is drawn.
+
+    Raises:
+        ValueError: the robot fell.
+    """
+    motion = driving(robot, np.random.default_rng(seed)) if motion is None else motion
+    senses, fields = bool(robot.SENSORS), {"duration": seconds, "control_dt": 1 / RATE, "arena_radius": 100.0}
+    task = make_task("stabilize", robot, **fields)
+    env = BallbotEnv(
+        task, physics, randomization=randomization, robot=robot, observation="sensors" if senses else "state"
+    )
+    driver: Any = _Driver(LqrController(task, robot), motion)
+    if senses or env.randomization.active:
+        driver = FilteredController(task, robot, "-ekf" if senses else "-adaptive-ekf", driver)
+    logger = _Logger(driver)
+    episode = rollout(env, logger, seed=seed, options={"state": np.zeros(robot.state_size)})
+    drawn = env.get_state().drawn
+    env.close()
+    if episode.failure:
+        raise ValueError(
+            f"the simulated robot fell after {episode.trajectory.duration:.1f} s ({episode.violated}); give another seed, or "
+            "a randomization that varies less"
+        )
+    true = env.randomization.robot(robot, drawn) if drawn else robot
+    delay = float(drawn[5]) / RATE if drawn else 0.0
+    return Recorded(_readings(robot, task, logger), true, true.force_limit / robot.force_limit, delay)  # pyright: ignore
+
+
+def _readings(robot: Ballbot, task: Task, logger: _Logger) -> Readings:
+    seen, commands = np.array(logger.seen), np.array(logger.commands)
+    t = np.arange(len(seen)) * task.control_dt
+    names, delays = _STATES, ()
+    if robot.SENSORS:
+        names = tuple(name for name in readable(robot) if name.startswith(("gyro", "accel", "wheel_angle")))
+        seen = seen[:, :9] * Sensors.SCALE
+        seen[:, 6:] = np.cumsum(seen[:, 6:], axis=0)
+        delays = (task.control_dt / 2,) * 6 + (0.0,) * 3  # gyroscope and accelerometer show means over a step
+    return Readings(names, t, seen, np.clip(commands, -robot.force_limit, robot.force_limit), delays)

@@ -1,0 +1,219 @@
+"""`ballbot identify`: from a log of a robot to the robot's file, with intervals, and what the log cannot tell."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ballbot_baselines.identification.identify import Identified
+from ballbot_baselines.identification.identify import identify as identified
+from ballbot_baselines.identification.likelihood import Readings, innovations
+from ballbot_baselines.identification.logs import LogError, description_text, log_text, read_description, read_log
+from ballbot_baselines.identification.record import Waves
+from ballbot_baselines.identification.record import record as recorded
+from ballbot_gym import files
+from ballbot_gym.lazy import imports_of
+from ballbot_gym.robot import Ballbot, named_robot, urdf_text
+from ballbot_train.report import figures
+from ballbot_train.work.console import (
+    Physics,
+    RobotName,
+    check_least,
+    console,
+    physics_or_default,
+    print_table,
+    progress_bar,
+)
+
+with imports_of(__name__):
+    import tyro
+
+_LONGEST = 600.0  # s of a recorded log
+_DOTS = 2000  # of a residual figure's axis
+
+
+def identify(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
+    robot: RobotName = "omni",
+    columns: Path | None = None,
+    known: tuple[str, ...] = (),
+    record: bool = False,
+    motion: Path | None = None,
+    seconds: float = 60.0,
+    physics: Physics | None = None,
+    randomization: str | None = None,
+    seed: int = 0,
+    out: Path = Path("runs/identify"),
+) -> None:
+    """Finds the numbers of a robot from logs of its motion, with 95 % intervals, and writes its URDF.
+
+    Args:
+        logs: CSV or Parquet files with the same columns.
+        robot: name of the nominal robot, or its URDF: what is known before, from drawings and data sheets.
+        columns: the TOML file that says what the columns are; default, next to the first log, with its name.
+        known: names of numbers that were measured otherwise and are held at those of the robot, such as body_mass.
+        record: record a log of a simulated robot instead.
+        motion: of --record: where the robot drives.
+        seconds: of --record: length of the log, s.
+        physics: of --record: "bullet", "mujoco" or "rk4"; default, the first that is installed.
+        randomization: of --record: name of the track that draws the robot, its drive and its sensors; default, "unknown" for
+            robots with wheels, and "real" for others.
+        seed: of --record: seed of what is drawn.
+        out: folder of the results.
+    """
+    nominal = named_robot(robot)
+    if not isinstance(nominal, Ballbot):
+        raise ValueError(f"identify is for ballbots, and {robot!r} is a {type(nominal).__name__}")
+    if record:
+        _refuse(bool(logs), "--record makes a log; leave out the paths of logs")
+        _record(nominal, robot, motion, seconds, physics, randomization, seed, out)
+        return
+    _refuse(not logs, "give the path of a log; `ballbot identify --record` makes one of a simulated robot")
+    description = read_description(columns or logs[0].with_suffix(".toml"), nominal)
+    read = [read_log(path, description, nominal) for path in logs]
+    with progress_bar() as progress:
+        bar = progress.add_task("likelihood", total=None)
+        result = identified(nominal, read, known, lambda done: progress.update(bar, completed=done))
+    _show(result)
+    _write(result, read[0].readings, robot, [str(path) for path in logs], out)
+
+
+def _refuse(wrong: bool, message: str) -> None:
+    if wrong:
+        raise ValueError(message)
+
+
+def _record(
+    nominal: Ballbot,
+    name: str,
+    motion: Path | None,
+    seconds: float,
+    physics: Physics | None,
+    track: str | None,
+    seed: int,
+    out: Path,
+) -> None:
+    """Records a log, and writes it next to the robot that made it."""
+    check_least(0, seed=seed)
+    _refuse(not 5 <= seconds <= _LONGEST, f"seconds must be from 5 to {_LONGEST:g}, not {seconds:g}")
+    track = track or ("unknown" if nominal.SENSORS else "real")
+    waves = None if motion is None else _motion(motion)
+    log = recorded(nominal, seconds, waves, track, physics_or_default(physics, name), seed)
+    path = files.write(out / "log.csv", log_text(log.readings))
+    files.write(out / "log.toml", description_text(log.readings))
+    true = files.write(out / "true.urdf", urdf_text(log.robot))
+    console.print(f"log: {path}, {seconds:g} s\ncolumns: {out / 'log.toml'}")
+    console.print(f"the robot that made it, with a delay of {1e3 * log.delay:g} ms: {true}")
+
+
+def _motion(path: Path) -> Waves:
+    """The motion of a file that --design wrote."""
+    held = files.read_json(path)
+    try:
+        parts = [files.numbers(held[name], f"{path}: {name}") for name in Waves._fields]
+    except KeyError as error:
+        raise LogError(f"{path} has no {error.args[0]!r}; give a motion that --design wrote") from None
+    k = len(parts[1])
+    _refuse([part.shape for part in parts] != [(3, k), (k,), (3, k)], f"{path} is no motion that --design wrote")
+    return Waves(*parts)
+
+
+def _show(result: Identified) -> None:
+    """Prints findings, numbers and predictions."""
+    for finding in result.findings:
+        console.print(f"• {finding}", soft_wrap=True)
+    print_table("numbers", ["", "nominal", "identified", "95 % interval", "unit", "from"], _rows(result))
+    console.print("rows from 'prior' are not in the log: they stay near the nominal robot")
+    for each in result.found.directions:
+        mixed = ", ".join(f"{share:+.2f} {name}" for name, share in each.shares.items())
+        console.print(f"the log cannot tell {mixed} (eigenvalue {each.eigenvalue:.1e} of the prior's)", soft_wrap=True)
+    shown = result.predictions
+    header = [
+        "median error",
+        *(f"{who}, {h:g} s" for h in shown.horizons for who in ("nominal", "identified", "no change")),
+    ]
+    rows = [
+        [
+            group,
+            *(
+                f"{error:.3g}"
+                for j in range(len(shown.horizons))
+                for error in (*shown.errors[:, i, j], shown.constant[i, j])
+            ),
+        ]
+        for i, group in enumerate(shown.groups)
+    ]
+    print_table("predictions of the last quarter, which was held back", header, rows)
+
+
+def _rows(result: Identified) -> list[list[str]]:
+    return [
+        [
+            each.parameter.name,
+            f"{each.parameter.nominal:.5g}",
+            f"{each.value:.5g}",
+            f"{each.low:.5g} to {each.high:.5g}",
+            each.parameter.unit,
+            "log" if each.told else "prior",
+        ]
+        for each in result.found.estimates
+    ]
+
+
+def _write(result: Identified, readings: Readings, robot: str, logs: list[str], out: Path) -> None:
+    """Writes the robot, its numbers as CSV and JSON, and the figure of residuals."""
+    found = result.found
+    rows: list[dict[str, Any]] = [
+        {
+            "name": each.parameter.name,
+            "unit": each.parameter.unit,
+            "nominal": each.parameter.nominal,
+            "value": each.value,
+            "low": each.low,
+            "high": each.high,
+            "told_by": "log" if each.told else "prior",
+        }
+        for each in found.estimates
+    ]
+    shown = result.predictions
+    record = {
+        "robot": robot,
+        "logs": logs,
+        "known": found.problem.known,
+        "numbers": rows,
+        "findings": result.findings,
+        "not_told": [each._asdict() for each in found.directions],
+        "predictions": {
+            "groups": shown.groups,
+            "horizons": shown.horizons,
+            **dict(zip(("nominal", "identified"), shown.errors.tolist(), strict=True)),
+            "no_change": shown.constant.tolist(),
+        },
+    }
+    files.write_csv(out / "numbers.csv", rows)
+    files.write(out / "numbers.json", json.dumps(record, indent=1, ensure_ascii=False))
+    figures.save(_residual_figure(result, readings), out / "residuals.png")
+    path = files.write(out / "robot.urdf", urdf_text(found.robot))
+    console.print(f"numbers: {out / 'numbers.csv'}\nresiduals: {out / 'residuals.png'}\nrobot: {path}")
+
+
+def _residual_figure(result: Identified, readings: Readings) -> Figure:
+    """Innovations over their expected deviations: white noise of size 1 where the robot explains the log."""
+    problem = result.found.problem
+    inside = innovations(problem.robot, readings, problem.lanes(result.found.z[None]))
+    scaled = np.where(np.isfinite(readings.y), inside.missed[:, 0] / np.sqrt(inside.variance[:, 0]), np.nan)
+    rows = math.ceil(len(readings.names) / 2)
+    figure = Figure(figsize=(12, 1.5 * rows + 1), layout="constrained")
+    every = max(1, len(scaled) // _DOTS)
+    for axis, name, values in zip(figure.subplots(rows, 2, squeeze=False).flat, readings.names, scaled.T, strict=False):
+        axis.plot(readings.t[::every], values[::every], ".", ms=2, alpha=0.5)
+        outside = np.nanmean(np.abs(values) > 1.96)
+        axis.set_title(f"{name}: {outside:.1%} beyond ±1.96, where 5 % are expected", fontsize=9)
+        axis.set_ylim(-5, 5)
+        axis.grid(alpha=0.3)
+    figure.supxlabel("time, s")
+    figure.supylabel("innovation over its expected deviation")
+    return figure
