@@ -12,7 +12,7 @@ from ballbot_baselines.identification.estimate import Problem, information
 from ballbot_baselines.identification.identify import identify
 from ballbot_baselines.identification.likelihood import Readings, commanded, innovations, readable
 from ballbot_baselines.identification.logs import Log, LogError, description_text, log_text, read_description, read_log
-from ballbot_baselines.identification.record import Recorded, record
+from ballbot_baselines.identification.record import Recorded, Waves, record, still
 from ballbot_gym import Randomization, named_robot
 from ballbot_gym.robot import Ballbot, read_urdf
 from ballbot_train.commands.identify import identify as command
@@ -320,7 +320,10 @@ def test_the_command_writes_a_robot_that_other_commands_take(readings: Readings,
     ("options", "message"),
     [
         ({}, "give the path of a log"),
-        ({"logs": (Path("log.csv"),), "record": True}, "leave out the paths of logs"),
+        ({"logs": (Path("log.csv"),), "record": True}, "give one of: paths of logs, --record, --design"),
+        ({"record": True, "design": True}, "give one of: paths of logs, --record, --design"),
+        ({"design": True, "max_lean": 60.0}, "max_lean must be from 1 to 30 degrees, not 60"),
+        ({"record": True, "motion": Path("none.json")}, "none.json: no such file"),
         ({"logs": (Path("none.csv"),)}, "none.toml: no such file"),
         ({"record": True, "seconds": 1.0}, "seconds must be from 5 to 600, not 1"),
         ({"record": True, "seed": -1}, "seed must be at least 0"),
@@ -329,3 +332,19 @@ def test_the_command_writes_a_robot_that_other_commands_take(readings: Readings,
 def test_the_command_says_what_is_wrong(options: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         command(**{"robot": "rolling", "out": tmp_path} | options)
+
+
+def test_a_designed_motion_tells_more_than_balancing_within_its_limit_of_lean(tmp_path: Path) -> None:
+    command(robot="rolling", design=True, seconds=5.0, max_lean=6.0, known=KNOWN, out=tmp_path)
+    held = json.loads((tmp_path / "motion.json").read_text())
+    motion = Waves(*(np.array(held[name]) for name in Waves._fields))
+    moved = record(ROBOT, 5.0, motion, None, "rk4")
+    assert moved.lean < 1.05 * np.radians(6.0)
+    still_made = record(ROBOT, 5.0, still, "noisy", "rk4")
+    problem = Problem(ROBOT, moved.readings.names, KNOWN)
+    i = [each.name for each in problem.parameters].index("com_height")
+    told, before = (
+        information(problem, [each.readings], np.zeros(len(problem.parameters)))[2][i, i]
+        for each in (moved, still_made)
+    )
+    assert told > 16 * before  # a quarter of the deviation

@@ -35,6 +35,8 @@ class Recorded(NamedTuple):
     """Ratio of the applied force to the command."""
     delay: float
     """s."""
+    lean: float
+    """The greatest, rad."""
 
 
 def still(t: float) -> np.ndarray:
@@ -65,6 +67,13 @@ def driving(robot: Ballbot, rng: np.random.Generator) -> Waves:
     along = acceleration / (2 * math.pi * frequencies) ** 2
     amplitudes = np.minimum([along, along, np.full(len(along), _TURN)], 2.0)
     return Waves(amplitudes, frequencies, rng.uniform(0, 2 * math.pi, amplitudes.shape))
+
+
+def recorded_names(robot: Ballbot) -> tuple[str, ...]:
+    """What `record` reads of a robot, see `readable`."""
+    if not robot.SENSORS:
+        return _STATES
+    return tuple(name for name in readable(robot) if name.startswith(("gyro", "accel", "wheel_angle")))
 
 
 class _Driver:
@@ -148,15 +157,15 @@ def record(
         )
     true = env.randomization.robot(robot, drawn) if drawn else robot
     delay = float(drawn[5]) / RATE if drawn else 0.0
-    return Recorded(_readings(robot, task, logger), true, true.force_limit / robot.force_limit, delay)  # pyright: ignore
+    readings, strength = _readings(robot, task, logger), true.force_limit / robot.force_limit
+    return Recorded(readings, true, strength, delay, episode.peak_tilt)  # pyright: ignore[reportArgumentType]
 
 
 def _readings(robot: Ballbot, task: Task, logger: _Logger) -> Readings:
     seen, commands = np.array(logger.seen), np.array(logger.commands)
     t = np.arange(len(seen)) * task.control_dt
-    names, delays = _STATES, ()
+    names, delays = recorded_names(robot), ()
     if robot.SENSORS:
-        names = tuple(name for name in readable(robot) if name.startswith(("gyro", "accel", "wheel_angle")))
         seen = seen[:, :9] * Sensors.SCALE
         seen[:, 6:] = np.cumsum(seen[:, 6:], axis=0)
         delays = (task.control_dt / 2,) * 6 + (0.0,) * 3  # gyroscope and accelerometer show means over a step

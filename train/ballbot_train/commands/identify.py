@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from ballbot_baselines.identification.design import design as designed
 from ballbot_baselines.identification.identify import Identified
 from ballbot_baselines.identification.identify import identify as identified
 from ballbot_baselines.identification.likelihood import Readings, innovations
@@ -41,8 +42,10 @@ def identify(
     columns: Path | None = None,
     known: tuple[str, ...] = (),
     record: bool = False,
+    design: bool = False,
     motion: Path | None = None,
-    seconds: float = 60.0,
+    seconds: float | None = None,
+    max_lean: float = 8.0,
     physics: Physics | None = None,
     randomization: str | None = None,
     seed: int = 0,
@@ -56,8 +59,10 @@ def identify(
         columns: the TOML file that says what the columns are; default, next to the first log, with its name.
         known: names of numbers that were measured otherwise and are held at those of the robot, such as body_mass.
         record: record a log of a simulated robot instead.
-        motion: of --record: where the robot drives.
-        seconds: of --record: length of the log, s.
+        design: find the motion that tells most about the robot instead.
+        motion: of --record: the motion.json that --design wrote; default, the robot drives in waves.
+        seconds: of --record and --design: length of the log, s; default, 60 and 20.
+        max_lean: of --design: the greatest lean, degrees.
         physics: of --record: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         randomization: of --record: name of the track that draws the robot, its drive and its sensors; default, "unknown" for
             robots with wheels, and "real" for others.
@@ -67,9 +72,15 @@ def identify(
     nominal = named_robot(robot)
     if not isinstance(nominal, Ballbot):
         raise ValueError(f"identify is for ballbots, and {robot!r} is a {type(nominal).__name__}")
-    if record:
-        _refuse(bool(logs), "--record makes a log; leave out the paths of logs")
-        _record(nominal, robot, motion, seconds, physics, randomization, seed, out)
+    if record or design:
+        _refuse(bool(logs) or (record and design), "give one of: paths of logs, --record, --design")
+        length = seconds or (60.0 if record else 20.0)
+        _refuse(not 5 <= length <= _LONGEST, f"seconds must be from 5 to {_LONGEST:g}, not {length:g}")
+        _refuse(not 1 <= max_lean <= 30, f"max_lean must be from 1 to 30 degrees, not {max_lean:g}")
+        if record:
+            _record(nominal, robot, motion, length, physics, randomization, seed, out)
+        else:
+            _design(nominal, length, math.radians(max_lean), known, out)
         return
     _refuse(not logs, "give the path of a log; `ballbot identify --record` makes one of a simulated robot")
     description = read_description(columns or logs[0].with_suffix(".toml"), nominal)
@@ -98,7 +109,6 @@ def _record(
 ) -> None:
     """Records a log, and writes it next to the robot that made it."""
     check_least(0, seed=seed)
-    _refuse(not 5 <= seconds <= _LONGEST, f"seconds must be from 5 to {_LONGEST:g}, not {seconds:g}")
     track = track or ("unknown" if nominal.SENSORS else "real")
     waves = None if motion is None else _motion(motion)
     log = recorded(nominal, seconds, waves, track, physics_or_default(physics, name), seed)
@@ -107,6 +117,26 @@ def _record(
     true = files.write(out / "true.urdf", urdf_text(log.robot))
     console.print(f"log: {path}, {seconds:g} s\ncolumns: {out / 'log.toml'}")
     console.print(f"the robot that made it, with a delay of {1e3 * log.delay:g} ms: {true}")
+
+
+def _design(nominal: Ballbot, seconds: float, max_lean: float, known: tuple[str, ...], out: Path) -> None:
+    """Finds a motion that tells much, writes it, and prints what it would tell."""
+    with progress_bar() as progress:
+        bar = progress.add_task("frequencies", total=None)
+        found = designed(
+            nominal, seconds, max_lean, known, lambda done, total: progress.update(bar, completed=done, total=total)
+        )
+    header = ["", "after balancing", "after this motion"]
+    each = zip(found.names, found.balancing, found.deviations, strict=True)
+    print_table(
+        f"standard deviations after {seconds:g} s, in those of the prior",
+        header,
+        [[n, f"{a:.3g}", f"{b:.3g}"] for n, a, b in each],
+    )
+    held = {name: np.asarray(value).tolist() for name, value in found.motion._asdict().items()}
+    path = files.write(out / "motion.json", json.dumps(held, indent=1))
+    console.print(f"intervals: {found.ratio:.2f} of those after balancing, as their geometric mean")
+    console.print(f"motion: {path}, with leans of up to {math.degrees(found.lean):.1f}°")
 
 
 def _motion(path: Path) -> Waves:

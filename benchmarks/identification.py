@@ -1,0 +1,160 @@
+"""How well logs tell robots, on logs of simulated robots drawn by seed: errors, coverage of intervals, predictions, time.
+
+    python benchmarks/identification.py --robot rolling --physics rk4 mujoco --robots 5
+
+For every robot that the track draws, a log of 60 s is recorded and identified, once as it is and once with glitches in 1 % of
+all readings and commands and stamps that jitter by 3 ms. A third copy has a wrong sign too. The robots were weighed: the
+masses of body and ball are given.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ballbot_baselines.identification.checks import predict
+from ballbot_baselines.identification.identify import Identified, identify
+from ballbot_baselines.identification.likelihood import Readings, commanded
+from ballbot_baselines.identification.logs import Log, LogError, description_text, log_text, read_description, read_log
+from ballbot_baselines.identification.record import Recorded, record
+from ballbot_gym import files, named_robot
+from ballbot_gym.robot import Ballbot
+
+_KNOWN = ("body_mass", "ball_mass")
+_GLITCHES, _SIZE, _JITTER = 0.01, 6.0, 0.003  # share, in standard deviations of a column, and s
+_TRUE = ("com_height", "inertia", "force_limit", "wheels.no_load_speed", "wheels.inertia", "wheels.spin_friction")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robot", default="rolling")
+    parser.add_argument("--physics", nargs="+", default=["rk4", "mujoco"])
+    parser.add_argument("--robots", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--out", type=Path, default=Path("runs/identification.csv"))
+    options = parser.parse_args()
+    nominal: Any = named_robot(options.robot)
+    track, rows = "unknown" if nominal.SENSORS else "real", []
+    for physics in options.physics:
+        for seed in range(options.robots):
+            try:
+                made = record(nominal, options.seconds, randomization=track, physics=physics, seed=seed)
+            except ValueError as error:
+                print(f"{physics} {seed}: {error}")
+                continue
+            weighed = replace(nominal, **{name: getattr(made.robot, name) for name in _KNOWN})
+            rng = np.random.default_rng(seed)
+            for kind, readings in (("clean", made.readings), ("dirty", dirty(made.readings, rng))):
+                found = measure(weighed, made, readings)
+                for row in found:
+                    rows.append({"physics": physics, "seed": seed, "log": kind} | row)
+            named = sign_is_named(weighed, dirty(made.readings, rng), rng)
+            rows.append({"physics": physics, "seed": seed, "log": "wrong sign"} | row_of("named", named, 1.0))
+            files.write_csv(options.out, rows)
+    summarize(rows)
+
+
+def dirty(readings: Readings, rng: np.random.Generator) -> Readings:
+    """A log with glitches in 1 % of readings and commands, and stamps that jitter."""
+
+    def hit(values: np.ndarray) -> np.ndarray:
+        wrong = values + rng.uniform(-_SIZE, _SIZE, values.shape) * values.std(axis=0)
+        return np.where(rng.random(values.shape) < _GLITCHES, wrong, values)
+
+    t = readings.t + rng.normal(0, _JITTER, len(readings.t))
+    return replace(readings, t=t, y=hit(readings.y), commands=hit(readings.commands))
+
+
+def through_files(readings: Readings, robot: Ballbot) -> Log:
+    """A log that was written and read again."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        path.write_text(log_text(readings))
+        path.with_suffix(".toml").write_text(description_text(readings))
+        return read_log(path, read_description(path.with_suffix(".toml"), robot), robot)
+
+
+def measure(robot: Ballbot, made: Recorded, readings: Readings) -> list[dict[str, Any]]:
+    """Rows of what one log told."""
+    log = through_files(readings, robot)
+    begin = time.process_time()
+    result = identify(robot, [log], _KNOWN)
+    rows = [row_of("seconds of one core", time.process_time() - begin, np.nan)]
+    named = sum("glitches" in each for each in result.findings), any("jitters" in each for each in result.findings)
+    rows += [row_of("columns with glitches named", named[0], np.nan), row_of("jitter named", float(named[1]), np.nan)]
+    truths = {"delay": made.delay} | {name: value_of(made.robot, name) for name in _TRUE if has(made.robot, name)}
+    for each in result.found.estimates:
+        if (true := truths.get(each.parameter.name)) is not None:
+            held = each.low <= true <= each.high
+            rows.append(row_of(each.parameter.name, each.value, true) | {"inside": held, "told": each.told})
+    return [*rows, *predictions(result, made, log)]
+
+
+def predictions(result: Identified, made: Recorded, log: Log) -> list[dict[str, Any]]:
+    """Errors of predictions over 0.5 s of the identified robot, over those of the true one."""
+    problem, n = result.found.problem, len(log.readings.t)
+    z = problem.z_of(made.robot, made.delay, result.found.z)
+    true = predict(problem, z[None], log.readings.between(round(0.75 * n), n))
+    ratios = result.predictions.errors[:, :, 1] / true.errors[0, :, 1]
+    nominal, identified = np.exp(np.log(ratios).mean(axis=1))
+    return [row_of("prediction error of the nominal robot", nominal, 1.0), row_of("prediction error", identified, 1.0)]
+
+
+def sign_is_named(robot: Ballbot, readings: Readings, rng: np.random.Generator) -> float:
+    """1 if a column whose sign is wrong is named, else 0."""
+    columns = [*readings.names, *commanded(robot)]
+    i = int(rng.integers(len(columns)))
+    y, commands = readings.y.copy(), readings.commands.copy()
+    (y if i < y.shape[1] else commands)[:, i % y.shape[1] if i >= y.shape[1] else i] *= -1
+    try:
+        identify(robot, [through_files(replace(readings, y=y, commands=commands), robot)], _KNOWN)
+    except LogError as error:
+        named = f"'{columns[i]}'" in str(error) and "sign" in str(error)
+        if not named:
+            print(f"{columns[i]}: {error}")
+        return float(named)
+    print(f"{columns[i]}: its sign is not named")
+    return 0.0
+
+
+def has(robot: Ballbot, name: str) -> bool:
+    return not name.startswith("wheels.") or bool(robot.wheel_radius)
+
+
+def value_of(robot: Any, name: str) -> float:
+    for part in name.split("."):
+        robot = getattr(robot, part)
+    return robot
+
+
+def row_of(name: str, value: float, true: float) -> dict[str, Any]:
+    return {"name": name, "value": value, "true": true, "inside": "", "told": ""}
+
+
+def summarize(rows: list[dict[str, Any]]) -> None:
+    """Prints medians and largest values by kind of log and quantity."""
+    for kind in dict.fromkeys(row["log"] for row in rows):
+        for name in dict.fromkeys(row["name"] for row in rows if row["log"] == kind):
+            own = [row for row in rows if (row["log"], row["name"]) == (kind, name)]
+            told = [row for row in own if row["told"] is True]
+            if own[0]["inside"] == "":
+                values = [row["value"] for row in own]
+                print(
+                    f"{kind}: {name}: median {np.median(values):.3g}, least {min(values):.3g}, largest {max(values):.3g}"
+                )
+                continue
+            unit, factor = ("ms", 1e3) if name == "delay" else ("%", 100.0)
+            sizes = [factor * abs(r["value"] - r["true"]) / (1.0 if name == "delay" else r["true"]) for r in own]
+            inside = sum(row["inside"] for row in own)
+            print(
+                f"{kind}: {name}: error median {np.median(sizes):.2g} {unit}, largest {max(sizes):.2g} {unit}; told in "
+                f"{len(told)}, inside the interval in {inside} of {len(own)}"
+            )
+
+
+if __name__ == "__main__":
+    main()
