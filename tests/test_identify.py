@@ -136,6 +136,20 @@ def test_glitches_are_named_and_left_out(readings: Readings, tmp_path: Path) -> 
     assert np.isnan(log.readings.y[[500, 900], 2]).all()
 
 
+def test_commands_that_are_glitches_are_guessed_and_their_forces_uncertain(readings: Readings, tmp_path: Path) -> None:
+    commands = readings.commands.copy()
+    commands[800, 0] = 300.0
+    log = written(replace(readings, commands=commands), tmp_path).readings
+    assert log.guessed is not None
+    assert log.guessed[800, 0] == pytest.approx(readings.commands[:, 0].std(), rel=0.1)
+    assert log.commands[800, 0] == pytest.approx(readings.commands[799:802, 0].mean(), abs=1.0)
+    problem = Problem(ROBOT, log.names)
+    lanes = problem.lanes(np.zeros((1, len(problem.parameters))))
+    sure, unsure = (innovations(ROBOT, replace(log, guessed=each), lanes).variance for each in (None, log.guessed))
+    speed = log.names.index("speed_x")
+    assert unsure[802, 0, speed] > sure[802, 0, speed]
+
+
 def test_stamps_that_jitter_are_named_and_replaced_by_the_clock(readings: Readings, tmp_path: Path) -> None:
     noise = np.random.default_rng(0).normal(0, 0.003, len(readings.t))
     log = written(replace(readings, t=readings.t + noise), tmp_path)

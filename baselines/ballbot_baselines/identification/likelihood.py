@@ -14,7 +14,7 @@ is installed.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -71,6 +71,7 @@ class Readings:
     | commands | (n, k) | in units of the robot's action, each from its time until the next |
     | delays | m | s, by which readings are about an earlier time than theirs; () for none |
     | restarts | | indices of the first readings after gaps |
+    | guessed | (n, k) | standard deviation of commands that are not in the log; None where all are |
     """
 
     names: tuple[str, ...]
@@ -79,11 +80,13 @@ class Readings:
     commands: np.ndarray
     delays: tuple[float, ...] = ()
     restarts: tuple[int, ...] = ()
+    guessed: np.ndarray | None = None
 
     def between(self, first: int, last: int) -> "Readings":
         """The readings from index `first` until before `last`."""
         cut, restarts = slice(first, last), tuple(i - first for i in self.restarts if first < i < last)
-        return Readings(self.names, self.t[cut], self.y[cut], self.commands[cut], self.delays, restarts)
+        guessed = None if self.guessed is None else self.guessed[cut]
+        return Readings(self.names, self.t[cut], self.y[cut], self.commands[cut], self.delays, restarts, guessed)
 
     @property
     def dt(self) -> float:
@@ -165,14 +168,18 @@ def innovations(robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.nd
     count = calls * LANES
     factors = np.ones((lane_count, m + readings.commands.shape[1])) if factors is None else factors
     forces, y = applied(readings, lanes) * factors[:, m:], readings.y[:, None, :] * factors[:, :m]
+    uncertain = np.zeros_like(forces)
+    if readings.guessed is not None:
+        uncertain = applied(replace(readings, commands=readings.guessed), lanes) ** 2
     used = np.isfinite(readings.y)
-    steps = np.zeros((n, count, 2 * m + 2 * forces.shape[2] + 1))
+    steps = np.zeros((n, count, 2 * m + 3 * forces.shape[2] + 1))
     steps[:, :lane_count] = np.concatenate(
         [
             np.where(used[:, None, :], y, 0.0),
             np.broadcast_to(used[:, None, :], y.shape),
             np.concatenate([forces[:1], forces[:-1]]),
             forces,
+            uncertain,
             np.broadcast_to(
                 np.diff(readings.t, append=readings.t[-1] + readings.dt)[:, None, None], (n, lane_count, 1)
             ),
@@ -242,16 +249,17 @@ def expected_readings(robot: Any, names: tuple[str, ...], x: tuple[Any, ...], u:
 def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substeps: int) -> tuple[casadi.Function, int]:
     """A step of `LANES` filters, and the size of their state.
 
-    (state and packed covariance before the readings; constants; readings, forces before and after, and the time until the
-    next readings, s) -> (state and packed covariance before the next readings; innovations, their variances, and the state)
+    (state and packed covariance before the readings; constants; readings, forces before and after, the variance of the
+    latter, and the time until the next readings, s) -> (state and packed covariance before the next readings; innovations,
+    their variances, and the state)
     """
     symbol, robot = casadi.SX.sym, kind.robot
     states, actions, m = len(robot.STATE), len(robot.ACTION), len(names)
     size, count = states + len(_angles(names)), len(kind.numbers) + len(robot.SENSORS)
     held, constants = symbol("held", size + size * (size + 1) // 2), symbol("constants", count + 2 * m + 2)
-    step = symbol("step", 2 * m + 2 * actions + 1)
+    step = symbol("step", 2 * m + 3 * actions + 1)
     numbers, bias, variance, drift = _split(constants, count, m, m, 2)
-    y, used, before, u, dt = _split(step, m, m, actions, actions, 1)
+    y, used, before, u, uncertain, dt = _split(step, m, m, actions, actions, actions, 1)
     model: Any = kind.model(numbers[: len(kind.numbers)])
     for name, number in zip(robot.SENSORS, numbers[len(kind.numbers) :], strict=True):
         object.__setattr__(model, name, number)
@@ -263,14 +271,14 @@ def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substep
     z, p, missed, expected_variance = _corrected(
         x, _unpacked(held[size:], size), (expected, casadi.jacobian(expected, x)), (y, used, bias, variance)
     )
-    own = _tuple(symbol("x", size))
-    slope = casadi.substitute(
-        casadi.jacobian(casadi.vertcat(*rates(own, u)), casadi.vertcat(*own)), casadi.vertcat(*own), z
-    )
-    moved = dt[0] * slope
+    at = symbol("x, u", size + actions)
+    slopes = casadi.jacobian(casadi.vertcat(*rates(_tuple(at[:size]), _tuple(at[size:]))), at)
+    slopes = dt[0] * casadi.substitute(slopes, at, casadi.vertcat(z, *u))
+    moved, by_force = slopes[:, :size], slopes[:, size:]
     transition = casadi.SX.eye(size) + moved + moved @ moved / 2
     speeds = [0.0 if i in _POSES or i >= states else drift[0] if i in (4, 5) else drift[1] for i in range(size)]
     p = transition @ p @ transition.T + dt[0] * casadi.diag(casadi.vertcat(*speeds))
+    p = p + by_force @ casadi.diag(casadi.vertcat(*uncertain)) @ by_force.T
     after = model.step(_tuple(z), u, dt[0], substeps, rates)
     packed = casadi.vertcat(*after, *(p[i, j] for i in range(size) for j in range(i, size)))
     outputs = [packed, casadi.vertcat(*missed, *expected_variance, z)]

@@ -238,9 +238,12 @@ def read_log(path: Path, description: Description, robot: Ballbot) -> Log:
     for name, column in values.items():
         _check_column(path, of[name].name, column)
         _remove_glitches(of[name].name, t, column, findings)
-    commands = [_filled(values[name]) for name in commanded(robot)]
     y = np.column_stack([values[name] for name in names])
-    readings = Readings(names, t, y, np.column_stack(commands), tuple(of[name].delay for name in names), restarts)
+    commands = np.column_stack([values[name] for name in commanded(robot)])
+    delays = tuple(of[name].delay for name in names)
+    guessed = np.where(np.isfinite(commands), 0.0, np.nanstd(commands, axis=0))
+    commands = np.column_stack([_filled(column) for column in commands.T])
+    readings = Readings(names, t, y, commands, delays, restarts, guessed if guessed.any() else None)
     return Log(path, description, readings, tuple(findings))
 
 
