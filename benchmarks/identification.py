@@ -1,4 +1,4 @@
-"""How well logs tell robots, on logs of simulated robots drawn by seed: errors, coverage of intervals, predictions, time.
+"""How exactly logs determine robots: errors, coverage of intervals, predictions and time, on robots drawn by seed.
 
     python benchmarks/identification.py --robot rolling --physics rk4 mujoco --robots 5
 
@@ -79,18 +79,18 @@ def through_files(readings: Readings, robot: Ballbot) -> Log:
 
 
 def measure(robot: Ballbot, made: Recorded, readings: Readings) -> list[dict[str, Any]]:
-    """Rows of what one log told."""
+    """Rows of what was found from one log."""
     log = through_files(readings, robot)
     begin = time.process_time()
     result = identify(robot, [log], _KNOWN)
     rows = [row_of("seconds of one core", time.process_time() - begin, np.nan)]
-    named = sum("glitches" in each for each in result.findings), any("jitters" in each for each in result.findings)
+    named = sum("glitch" in each for each in result.findings), any("jitters" in each for each in result.findings)
     rows += [row_of("columns with glitches named", named[0], np.nan), row_of("jitter named", float(named[1]), np.nan)]
     truths = {"delay": made.delay} | {name: value_of(made.robot, name) for name in _TRUE if has(made.robot, name)}
     for each in result.found.estimates:
         if (true := truths.get(each.parameter.name)) is not None:
             held = each.low <= true <= each.high
-            rows.append(row_of(each.parameter.name, each.value, true) | {"inside": held, "told": each.told})
+            rows.append(row_of(each.parameter.name, each.value, true) | {"inside": held, "determined": each.determined})
     return [*rows, *predictions(result, made, log)]
 
 
@@ -132,7 +132,7 @@ def value_of(robot: Any, name: str) -> float:
 
 
 def row_of(name: str, value: float, true: float) -> dict[str, Any]:
-    return {"name": name, "value": value, "true": true, "inside": "", "told": ""}
+    return {"name": name, "value": value, "true": true, "inside": "", "determined": ""}
 
 
 def summarize(rows: list[dict[str, Any]]) -> None:
@@ -140,7 +140,7 @@ def summarize(rows: list[dict[str, Any]]) -> None:
     for kind in dict.fromkeys(row["log"] for row in rows):
         for name in dict.fromkeys(row["name"] for row in rows if row["log"] == kind):
             own = [row for row in rows if (row["log"], row["name"]) == (kind, name)]
-            told = [row for row in own if row["told"] is True]
+            determined = [row for row in own if row["determined"] is True]
             if own[0]["inside"] == "":
                 values = [row["value"] for row in own]
                 print(
@@ -151,8 +151,8 @@ def summarize(rows: list[dict[str, Any]]) -> None:
             sizes = [factor * abs(r["value"] - r["true"]) / (1.0 if name == "delay" else r["true"]) for r in own]
             inside = sum(row["inside"] for row in own)
             print(
-                f"{kind}: {name}: error median {np.median(sizes):.2g} {unit}, largest {max(sizes):.2g} {unit}; told in "
-                f"{len(told)}, inside the interval in {inside} of {len(own)}"
+                f"{kind}: {name}: error median {np.median(sizes):.2g} {unit}, largest {max(sizes):.2g} {unit}; determined in "
+                f"{len(determined)}, inside the interval in {inside} of {len(own)}"
             )
 
 

@@ -67,7 +67,7 @@ def test_a_log_is_the_same_after_it_was_written_and_read(readings: Readings, tmp
     np.testing.assert_allclose(log.readings.t, readings.t, atol=1e-9)
 
 
-def test_a_log_tells_the_robot_and_its_delay(recorded: Recorded, tmp_path: Path) -> None:
+def test_a_log_determines_the_robot_and_its_delay(recorded: Recorded, tmp_path: Path) -> None:
     result = identify(ROBOT, [written(recorded.readings, tmp_path)], KNOWN)
     by_name = {each.parameter.name: each for each in result.found.estimates}
     for name, true in {
@@ -76,7 +76,7 @@ def test_a_log_tells_the_robot_and_its_delay(recorded: Recorded, tmp_path: Path)
         "delay": recorded.delay,
     }.items():
         each = by_name[name]
-        assert each.told
+        assert each.determined
         # 1.5 intervals are 2.9 standard deviations
         assert abs(each.value - true) < 1.5 * (each.high - each.low) / 2, name
     assert by_name["com_height"].value == pytest.approx(recorded.robot.com_height, rel=0.02)
@@ -87,16 +87,16 @@ def test_a_log_tells_the_robot_and_its_delay(recorded: Recorded, tmp_path: Path)
     assert result.found.robot.com_height == by_name["com_height"].value
 
 
-def test_a_log_cannot_tell_masses_from_the_strength_of_the_drive(recorded: Recorded) -> None:
+def test_a_log_does_not_separate_masses_from_the_strength_of_the_drive(recorded: Recorded) -> None:
     """All masses, all inertias and the forces times one factor move the robot the same way."""
     problem = Problem(ROBOT, recorded.readings.names)
-    _, _, told = information(problem, [recorded.readings], np.zeros(len(problem.parameters)))
-    scale = np.zeros(len(told))
+    _, _, h = information(problem, [recorded.readings], np.zeros(len(problem.parameters)))
+    scale = np.zeros(len(h))
     for i, each in enumerate(problem.parameters):
         if each.name in ("body_mass", "ball_mass", "inertia", "axial_inertia", "force_limit"):
             scale[i] = 1 / each.spread
     scale /= np.linalg.norm(scale)
-    assert scale @ told @ scale < 1e-6 * np.trace(told)
+    assert scale @ h @ scale < 1e-6 * np.trace(h)
 
 
 def test_innovations_of_the_true_robot_are_as_large_as_expected(recorded: Recorded) -> None:
@@ -163,7 +163,7 @@ def test_a_gap_is_named_and_the_filter_starts_again_after_it(readings: Readings,
     cut = replace(readings, t=readings.t[kept], y=readings.y[kept], commands=readings.commands[kept])
     log = written(cut, tmp_path)
     assert log.readings.restarts == (700,)
-    assert any("1 gaps: 1.010 s at 6.990 s" in each for each in log.findings)
+    assert any("1 gap: 1.010 s at 6.990 s" in each for each in log.findings)
 
 
 @pytest.mark.parametrize("name", ["position_x", "lean_y", "lean_rate_x", "speed_y", "command_y"])
@@ -304,8 +304,8 @@ def test_rows_that_are_no_numbers_or_go_back_in_time_are_named(tmp_path: Path) -
     (tmp_path / "log.csv").write_text("\n".join(["time,a,b,c", *rows]))
     (tmp_path / "log.toml").write_text(GOOD)
     log = read_log(tmp_path / "log.csv", read_description(tmp_path / "log.toml", ROBOT), ROBOT)
-    assert any("column 'c': 1 cells hold no number, the first 'err' in row 51" in each for each in log.findings)
-    assert any("the clock goes back in 1 rows, the first row 201 at 0.100 s" in each for each in log.findings)
+    assert any("column 'c': 1 cell without a number, the first 'err' in row 51" in each for each in log.findings)
+    assert any("the clock goes back in 1 row, the first row 201 at 0.100 s" in each for each in log.findings)
     assert len(log.readings.t) == 999
 
 
@@ -314,6 +314,15 @@ def test_quantities_are_those_that_the_robot_has() -> None:
     assert {"heading", "gyro_z", "wheel_angle_3"} <= set(readable(named_robot("omni")))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="unknown parameter 'mass'; known: 'body_mass', 'ball_mass'"):
         Problem(ROBOT, ("lean_x",), ("mass",))
+
+
+def test_numbers_that_are_0_in_the_nominal_robot_stay_0() -> None:
+    omni: Any = named_robot("omni")
+    robot = replace(omni, wheels=replace(omni.wheels, damping=0.0))
+    problem = Problem(robot, ("gyro_x",))
+    assert "wheels.damping" not in [each.name for each in problem.parameters]
+    nominal = problem.values(np.zeros((1, len(problem.parameters))))
+    assert problem.robot_of({name: float(value[0]) for name, value in nominal.items()}) == robot
 
 
 def test_the_command_writes_a_robot_that_other_commands_take(readings: Readings, tmp_path: Path) -> None:
@@ -348,7 +357,7 @@ def test_the_command_says_what_is_wrong(options: dict[str, Any], message: str, t
         command(**{"robot": "rolling", "out": tmp_path} | options)
 
 
-def test_a_designed_motion_tells_more_than_balancing_within_its_limit_of_lean(tmp_path: Path) -> None:
+def test_a_designed_motion_is_more_informative_than_balancing_within_its_limit_of_lean(tmp_path: Path) -> None:
     command(robot="rolling", design=True, seconds=5.0, max_lean=6.0, known=KNOWN, out=tmp_path)
     held = json.loads((tmp_path / "motion.json").read_text())
     motion = Waves(*(np.array(held[name]) for name in Waves._fields))
@@ -357,8 +366,8 @@ def test_a_designed_motion_tells_more_than_balancing_within_its_limit_of_lean(tm
     still_made = record(ROBOT, 5.0, still, "noisy", "rk4")
     problem = Problem(ROBOT, moved.readings.names, KNOWN)
     i = [each.name for each in problem.parameters].index("com_height")
-    told, before = (
+    moving, balancing = (
         information(problem, [each.readings], np.zeros(len(problem.parameters)))[2][i, i]
         for each in (moved, still_made)
     )
-    assert told > 16 * before  # a quarter of the deviation
+    assert moving > 16 * balancing  # a quarter of the deviation

@@ -18,7 +18,7 @@ from ballbot_baselines.identification.likelihood import (
 
 HORIZONS = (0.1, 0.5, 1.0)
 """How far ahead motions are predicted, s."""
-_SECONDS = 15.0  # of a log, from which signs and units are judged
+_SECONDS = 15.0  # of a log that are enough to judge signs and units
 _LOUDER, _LOOSER = 2.0, 4.0  # times the noise and drift that estimates start from: the robot is not the nominal one
 _CLEAR = 0.1  # how much likelier a log must be with another sign or unit, per time, as a logarithm
 _MOST = 50.0  # of a squared innovation over its variance: one that is wrong may be wrong without bounds
@@ -30,7 +30,7 @@ _UNITS = {
     1e3: "is a thousand times too small",
     1e-3: "is a thousand times too large",
 }
-_STARTS = 0.1  # s between the times from which motions are predicted
+_STARTS = 0.1  # s between the starts of predictions
 _BEGIN = 1.0  # s that a filter has to find the state
 
 
@@ -42,12 +42,12 @@ class _Suspicion(NamedTuple):
 
 
 class Suspect(NamedTuple):
-    """Columns that are wrong, as far as the log itself tells."""
+    """Columns that are wrong, judged from the log alone."""
 
     names: tuple[str, ...]
     fault: str
     others: tuple[tuple[str, ...], ...]
-    """Columns of which the same would explain the log nearly as well."""
+    """Other columns: if they had this fault, that would explain the log nearly as well."""
 
 
 def suspect(problem: Problem, readings: Readings) -> Suspect | None:

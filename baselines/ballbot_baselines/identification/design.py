@@ -1,4 +1,4 @@
-"""Which motion tells most of a robot, within a limit of lean.
+"""The motion that is most informative about a robot, within a limit of lean.
 
 A motion consists of circles of several frequencies. Near the upright robot everything is linear, so the information of a log
 is about Σ w_f H_f: that of each frequency alone at the greatest lean, H_f, times the share w_f of its squared lean. The
@@ -100,8 +100,8 @@ def _information(problem: Problem, made: Recorded) -> np.ndarray:
     return information(problem, [made.readings], np.zeros(len(problem.parameters)))[2]
 
 
-def _deviations(told: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.diag(np.linalg.inv(told + np.eye(len(told)))))
+def _deviations(h: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.diag(np.linalg.inv(h + np.eye(len(h)))))
 
 
 def _best_shares(alone: np.ndarray) -> np.ndarray:
@@ -109,8 +109,8 @@ def _best_shares(alone: np.ndarray) -> np.ndarray:
     count, own = len(alone), np.eye(alone.shape[1])
 
     def volume(w: np.ndarray) -> tuple[float, np.ndarray]:
-        told = own + np.tensordot(w, alone, 1)
-        return -np.linalg.slogdet(told)[1], -np.einsum("fij,ji->f", alone, np.linalg.inv(told))
+        h = own + np.tensordot(w, alone, 1)
+        return -np.linalg.slogdet(h)[1], -np.einsum("fij,ji->f", alone, np.linalg.inv(h))
 
     found = scipy.optimize.minimize(
         volume, np.full(count, 1 / count), jac=True, method="SLSQP", bounds=[(0.0, 1.0)] * count,

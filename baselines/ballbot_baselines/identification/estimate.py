@@ -1,4 +1,4 @@
-"""The numbers of a robot that make a log most likely, with intervals, and what the log cannot tell.
+"""The numbers of a robot that make a log most likely, with intervals, and what the log does not determine.
 
 Every parameter has a prior: the nominal robot, with the spread that drawings and data sheets usually have. In units z of
 these spreads, with z = 0 for the nominal robot, the estimate minimizes
@@ -6,15 +6,15 @@ these spreads, with z = 0 for the nominal robot, the estimate minimizes
     ½ |z|² − log-likelihood(z),
 
 where the likelihood is that of `likelihood`. Its second derivative is I + H with the Fisher information H of the log, and
-the inverse of that is the covariance of z. If an eigenvalue of H is far above 1, the log tells the combination of parameters
-that is its eigenvector. If an eigenvalue is below 1, the log tells less than the prior, and the combination stays near that
-of the nominal robot.
+the inverse of that is the covariance of z. If an eigenvalue of H is far above 1, the log determines the combination of
+parameters that is its eigenvector. If an eigenvalue is below 1, the prior has more information than the log, and the
+combination stays near that of the nominal robot.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -33,7 +33,7 @@ _NOISES = {
     "position": 0.005, "lean": 0.005, "speed": 0.03, "lean_rate": 0.02, "heading": 0.01, "heading_rate": 0.02,
     "ball_spin": 0.05, "gyro": 0.01, "accel": 0.1, "wheel_speed": 0.1, "wheel_angle": 0.002,
 }  # fmt: skip
-"""Standard deviation of a reading's noise, SI units, from which the estimate starts."""
+"""Standard deviation of a reading's noise, SI units, at the start of the estimate."""
 _DRIFTS = {"speed drift": 0.05, "lean rate drift": 0.05}  # m/s and rad/s in a second
 _LEAST_DRIFT = 1e-3  # the same: no robot follows equations better
 _NOISE_SPREAD = 2.0  # of the logarithm of noises and drifts: next to nothing is known before
@@ -41,7 +41,7 @@ _OUTLIER = 5.0  # deviations: one in two million readings is this far by chance
 _DIFFERENCE = 0.01  # of z, for derivatives
 _ROUNDS = 60
 _NEAR = 1e-3  # the squared distance to the minimum, in standard deviations of the estimate, at which the search ends
-_TOLD = 0.25  # the log tells a parameter if it narrows the prior's interval to this share
+_DETERMINED = 0.25  # the log determines a parameter if it narrows the prior's interval to this share
 _WITHIN_95 = 1.96
 
 
@@ -61,19 +61,19 @@ class Parameter(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A parameter as a log tells it."""
+    """A parameter as a log determines it."""
 
     parameter: Parameter
     value: float
     low: float
     high: float
     """The 95 % interval, of log and prior together."""
-    told: bool
-    """Whether the log tells it, and not the prior alone."""
+    determined: bool
+    """Whether the log determines it, and not the prior alone."""
 
 
 class Direction(NamedTuple):
-    """A combination of parameters, with what the log tells of it compared with the prior."""
+    """A combination of parameters, with the information of the log about it compared with that of the prior."""
 
     eigenvalue: float
     shares: dict[str, float]
@@ -109,7 +109,7 @@ class Problem:
         robot = [
             Parameter(name, _UNITS[name], attrgetter(name)(self.robot), spread, positive=True)
             for name, spread in _SPREADS.items()
-            if (name in _UNITS and not name.startswith("wheels.")) or self.robot.wheel_radius
+            if "." not in name or name.partition(".")[0] in self.robot.PARTS
         ]
         drive = [
             Parameter("delay", "s", 0.0, _DELAY, positive=False),
@@ -139,8 +139,9 @@ class Problem:
         own = {name: values[name] for name in _SPREADS if name in values and "." not in name}
         if (inertia := getattr(self.robot, "ball_inertia", None)) is not None:
             own["ball_inertia"] = inertia * (own["ball_mass"] / self.robot.ball_mass)
-        if wheels := {name.partition(".")[2]: values[name] for name in _SPREADS if name in values and "." in name}:
-            own["wheels"] = replace(cast(Any, self.robot).wheels, **wheels)
+        for part in self.robot.PARTS:
+            inner = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{part}.")}
+            own[part] = replace(getattr(self.robot, part), **inner)
         return replace(self.robot, **own)
 
     def z_of(self, robot: Ballbot, delay: float, like: np.ndarray) -> np.ndarray:
@@ -183,7 +184,7 @@ def group_of(name: str) -> str:
 
 @dataclass(frozen=True)
 class Found:
-    """What a log told.
+    """What was found from logs.
 
     | field | shape | meaning |
     |---|---|---|
@@ -220,14 +221,14 @@ class Found:
             Estimate(
                 each,
                 *(float(each.value(z + step * deviation)) for step in (0.0, -_WITHIN_95, _WITHIN_95)),
-                told=bool(deviation < _TOLD),
+                determined=bool(deviation < _DETERMINED),
             )
             for each, z, deviation in zip(self.problem.parameters, self.z, deviations, strict=True)
         ]
 
     @property
     def directions(self) -> list[Direction]:
-        """The combinations of parameters of which the log tells less than the prior, the least first."""
+        """The combinations of parameters about which the prior has more information than the log, the least first."""
         eigenvalues, vectors = np.linalg.eigh(self.information)
         names = [each.name for each in self.problem.parameters]
         found = []

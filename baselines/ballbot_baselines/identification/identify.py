@@ -17,7 +17,7 @@ _FAR = 3.0  # spreads of the prior
 
 @dataclass(frozen=True)
 class Identified:
-    """What logs told of a robot.
+    """What was found about a robot.
 
     | field | meaning |
     |---|---|
@@ -67,7 +67,7 @@ def identify(
         )
     findings = [f"{log.path}: {finding}" for log in logs for finding in log.findings]
     if found.outliers:
-        findings.append(f"{found.outliers} more readings contradict the motion of the robot; they are left out")
+        findings.append(f"readings that contradict the motion of the robot: {found.outliers} more; left out")
     findings += [
         f"{each.name} is {each.value(z):.4g} {each.unit}, far from the nominal {each.nominal:.4g}: are all columns in the "
         "right unit?"

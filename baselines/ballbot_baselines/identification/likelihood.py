@@ -37,7 +37,7 @@ _ANGLES = {"wheel_angle_1": "rad", "wheel_angle_2": "rad", "wheel_angle_3": "rad
 QUANTITIES = _STATES | _READINGS | _ANGLES
 """Every quantity that a log may have, with its unit."""
 COMMANDS = {2: ("command_x", "command_y"), 3: ("command_1", "command_2", "command_3")}
-"""Names of the commands of robots with so many actuators."""
+"""Names of the commands of robots by their number of actuators."""
 _POSES = {0, 1, 2, 3, 8}  # components of a state without noise of their own: their rates have it
 _START = np.array([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.5, 0.5, 0.1, 0.5, 0.5])
 """Standard deviation of each component of a state that is not read, before the first reading, SI units."""
@@ -196,7 +196,7 @@ def innovations(robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.nd
     restarts = {0, *readings.restarts}
     for i in range(n):
         if i in restarts:
-            pair[i % 2][:] = _starts(readings, i, y[i], size, count)
+            pair[i % 2][:] = _starts(readings, i, y, size, count)
         now[:] = steps[i]
         run[i % 2]()
         every[i] = found[:lane_count]
@@ -204,13 +204,14 @@ def innovations(robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.nd
 
 
 def _starts(readings: Readings, i: int, y: np.ndarray, size: int, count: int) -> np.ndarray:
-    """(count, ...) states and packed covariances of filters that begin at index i, whose readings are y (B, m)."""
+    """(count, ...) states and packed covariances of filters that begin at index i, of a log with y (n, B, m)."""
     x, spread = np.zeros((count, size)), np.full(size, 0.1)
     spread[: min(size, len(_START))] = _START[:size]
     places = _places(readings.names, size)
     for j, name in enumerate(readings.names):
-        if name in places and np.isfinite(readings.y[i, j]):
-            x[: len(y), places[name]], x[len(y) :, places[name]] = y[:, j], y[0, j]
+        later = i + int(np.argmax(np.isfinite(readings.y[i:, j])))  # the first reading, which may come later
+        if name in places and np.isfinite(readings.y[later, j]):
+            x[: y.shape[1], places[name]], x[y.shape[1] :, places[name]] = y[later, :, j], y[later, 0, j]
     upper = np.diag(spread**2)[np.triu_indices(size)]
     return np.hstack([x, np.broadcast_to(upper, (count, len(upper)))])
 

@@ -56,7 +56,7 @@ _LEAST_SECONDS = 5.0
 _LEAST_SHARE = 0.5  # of a column that must be readings
 _GAP = 3.0  # times between readings, in median ones
 _JITTER = 0.005  # of the time between readings, above which it is a finding
-_FAR, _FAR_HERE = 10.0, 8.0  # typical errors, of the whole log and nearby, from which a reading is a glitch
+_FAR, _FAR_HERE = 10.0, 8.0  # typical errors of the whole log, and of those nearby: readings further off are glitches
 _NEARBY = 101  # readings
 _GLITCH_ROUNDS = 20
 _EXAMPLES = 3
@@ -299,7 +299,9 @@ def _numbers(path: Path, name: str, cells: Any, findings: list[str]) -> np.ndarr
         raise LogError(f"{path}: column {name!r} holds no numbers, but {cells[wrong[0]]!r} for example")
     if wrong:
         first = f"{cells[wrong[0]]!r} in row {wrong[0] + 1}"
-        findings.append(f"column {name!r}: {len(wrong)} cells hold no number, the first {first}; they are left out")
+        findings.append(
+            f"column {name!r}: {_counted(len(wrong), 'cell')} without a number, the first {first}; left out"
+        )
     return values
 
 
@@ -314,13 +316,10 @@ def _rows_in_time(path: Path, t: np.ndarray, findings: list[str]) -> np.ndarray:
     if len(kept) < _LEAST_SHARE * len(t):
         raise LogError(f"{path}: the time grows in {len(kept)} of {len(t)} rows only; is that column the time?")
     if len(known) < len(t):
-        findings.append(f"time: {len(t) - len(known)} rows have no time; they are left out")
+        findings.append(f"time: {_counted(len(t) - len(known), 'row')} without a time; left out")
     if back.any():
-        first = known[back][0]
-        findings.append(
-            f"time: the clock goes back in {back.sum()} rows, the first row {first + 1} at {t[first]:.3f} s; they are left "
-            "out"
-        )
+        first, rows = known[back][0], _counted(int(back.sum()), "row")
+        findings.append(f"time: the clock goes back in {rows}, the first row {first + 1} at {t[first]:.3f} s; left out")
     return kept
 
 
@@ -335,7 +334,7 @@ def _clock(t: np.ndarray, findings: list[str]) -> tuple[np.ndarray, np.ndarray, 
     after = np.flatnonzero(steps > _GAP * dt) + 1
     if len(after):
         shown = ", ".join(f"{steps[i - 1]:.3f} s at {t[i - 1]:.3f} s" for i in after[:_EXAMPLES])
-        findings.append(f"time: {len(after)} gaps: {shown}; the filter starts again after each")
+        findings.append(f"time: {_counted(len(after), 'gap')}: {shown}; the filter starts again after each")
     regular, jitter, apart = t.copy(), [], []
     for first, last in zip([0, *after], [*after, len(t)], strict=True):
         if last - first > 2:
@@ -388,8 +387,12 @@ def _remove_glitches(name: str, t: np.ndarray, values: np.ndarray, findings: lis
     if glitches:
         glitches.sort()
         shown = ", ".join(f"{read[i]:.3g} at {t[i]:.3f} s" for i in glitches[:_EXAMPLES])
-        share = f"{len(glitches)} glitches ({len(glitches) / len(values):.2%})"
-        findings.append(f"column {name!r}: {share}, in SI units {shown}; they are left out")
+        share = f"{_counted(len(glitches), 'glitch', 'es')} ({len(glitches) / len(values):.2%})"
+        findings.append(f"column {name!r}: {share}, in SI units {shown}; left out")
+
+
+def _counted(count: int, what: str, ending: str = "s") -> str:
+    return f"{count} {what}{ending if count != 1 else ''}"
 
 
 def _contradictions(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`ballbot identify`: from a log of a robot to the robot's file, with intervals, and what the log cannot tell."""
+"""`ballbot identify`: from a log of a robot to the robot's file, with intervals, and what the log does not determine."""
 
 import json
 import math
@@ -59,7 +59,7 @@ def identify(
         columns: the TOML file that says what the columns are; default, next to the first log, with its name.
         known: names of numbers that were measured otherwise and are held at those of the robot, such as body_mass.
         record: record a log of a simulated robot instead.
-        design: find the motion that tells most about the robot instead.
+        design: find the most informative motion instead.
         motion: of --record: the motion.json that --design wrote; default, the robot drives in waves.
         seconds: of --record and --design: length of the log, s; default, 60 and 20.
         max_lean: of --design: the greatest lean, degrees.
@@ -120,7 +120,7 @@ def _record(
 
 
 def _design(nominal: Ballbot, seconds: float, max_lean: float, known: tuple[str, ...], out: Path) -> None:
-    """Finds a motion that tells much, writes it, and prints what it would tell."""
+    """Finds the most informative motion, writes it, and prints how exactly a log of it would determine the robot."""
     with progress_bar() as progress:
         bar = progress.add_task("frequencies", total=None)
         found = designed(
@@ -159,7 +159,9 @@ def _show(result: Identified) -> None:
     console.print("rows from 'prior' are not in the log: they stay near the nominal robot")
     for each in result.found.directions:
         mixed = ", ".join(f"{share:+.2f} {name}" for name, share in each.shares.items())
-        console.print(f"the log cannot tell {mixed} (eigenvalue {each.eigenvalue:.1e} of the prior's)", soft_wrap=True)
+        console.print(
+            f"the log does not determine {mixed} (eigenvalue {each.eigenvalue:.1e} of the prior's)", soft_wrap=True
+        )
     shown = result.predictions
     header = [
         "median error",
@@ -187,7 +189,7 @@ def _rows(result: Identified) -> list[list[str]]:
             f"{each.value:.5g}",
             f"{each.low:.5g} to {each.high:.5g}",
             each.parameter.unit,
-            "log" if each.told else "prior",
+            "log" if each.determined else "prior",
         ]
         for each in result.found.estimates
     ]
@@ -204,7 +206,7 @@ def _write(result: Identified, readings: Readings, robot: str, logs: list[str], 
             "value": each.value,
             "low": each.low,
             "high": each.high,
-            "told_by": "log" if each.told else "prior",
+            "determined_by": "log" if each.determined else "prior",
         }
         for each in found.estimates
     ]
@@ -215,7 +217,7 @@ def _write(result: Identified, readings: Readings, robot: str, logs: list[str], 
         "known": found.problem.known,
         "numbers": rows,
         "findings": result.findings,
-        "not_told": [each._asdict() for each in found.directions],
+        "not_determined": [each._asdict() for each in found.directions],
         "predictions": {
             "groups": shown.groups,
             "horizons": shown.horizons,
