@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballbot_baselines.identification.estimate import Problem, information
+from ballbot_baselines.identification.estimate import Problem, information, most_likely
 from ballbot_baselines.identification.identify import identify
 from ballbot_baselines.identification.likelihood import Readings, commanded, innovations, readable
 from ballbot_baselines.identification.logs import Log, LogError, description_text, log_text, read_description, read_log
@@ -148,6 +148,17 @@ def test_commands_that_are_glitches_are_guessed_and_their_forces_uncertain(readi
     sure, unsure = (innovations(ROBOT, replace(log, guessed=each), lanes).variance for each in (None, log.guessed))
     speed = log.names.index("speed_x")
     assert unsure[802, 0, speed] > sure[802, 0, speed]
+
+
+def test_glitches_in_commands_do_not_move_the_delay(recorded: Recorded, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    commands = recorded.readings.commands.copy()
+    hit = rng.random(commands.shape) < 0.01
+    commands[hit] += 100 * rng.choice([-1, 1], hit.sum())
+    log = written(replace(recorded.readings, commands=commands), tmp_path).readings
+    problem = Problem(ROBOT, log.names, KNOWN)
+    found = {each.parameter.name: each.value for each in most_likely(problem, [log]).estimates}
+    assert found["delay"] == pytest.approx(recorded.delay, abs=0.003)
 
 
 def test_stamps_that_jitter_are_named_and_replaced_by_the_clock(readings: Readings, tmp_path: Path) -> None:

@@ -170,7 +170,8 @@ def innovations(robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.nd
     forces, y = applied(readings, lanes) * factors[:, m:], readings.y[:, None, :] * factors[:, :m]
     uncertain = np.zeros_like(forces)
     if readings.guessed is not None:
-        uncertain = applied(replace(readings, commands=readings.guessed), lanes) ** 2
+        # variances and not deviations, whose sum over steps would depend on the delay
+        uncertain = applied(replace(readings, commands=readings.guessed**2), lanes) * lanes.strength[:, None]
     used = np.isfinite(readings.y)
     steps = np.zeros((n, count, 2 * m + 3 * forces.shape[2] + 1))
     steps[:, :lane_count] = np.concatenate(
