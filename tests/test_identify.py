@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ballbot_baselines.identification.checks import predict
 from ballbot_baselines.identification.estimate import Problem, information, most_likely
 from ballbot_baselines.identification.identify import identify
 from ballbot_baselines.identification.likelihood import Readings, commanded, innovations, readable
@@ -124,6 +125,17 @@ def test_the_slope_of_the_likelihood_is_that_of_its_values(readings: Readings) -
     for i in range(len(z)):
         (up, *_), (down, *_) = (information(problem, [part], z + sign * step * np.eye(len(z))[i]) for sign in (1, -1))
         assert slope[i] == pytest.approx((up - down) / (2 * step), rel=0.02, abs=0.5)
+
+
+def test_predictions_of_a_slow_log_are_of_the_next_reading_at_least(readings: Readings) -> None:
+    t, y, commands = (each[::50] for each in (readings.t, readings.y, readings.commands))
+    problem = Problem(ROBOT, readings.names)
+    z = np.zeros((1, len(problem.parameters)))
+    found = predict(problem, z, replace(readings, t=t, y=y, commands=commands))
+    assert found.horizons[:2] == (0.1, 0.5)  # of a log with a reading every 0.5 s
+    np.testing.assert_array_equal(found.errors[..., 0], found.errors[..., 1])
+    np.testing.assert_array_equal(found.constant[:, 0], found.constant[:, 1])
+    assert (found.constant > 0).all()
 
 
 def test_glitches_are_named_and_left_out(readings: Readings, tmp_path: Path) -> None:

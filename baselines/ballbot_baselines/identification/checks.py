@@ -133,7 +133,7 @@ def predict(problem: Problem, z: np.ndarray, readings: Readings) -> Predictions:
     """
     lanes, dt = problem.lanes(z), readings.dt
     found, forces = innovations(problem.robot, readings, lanes), applied(readings, lanes)
-    steps = [round(horizon / dt) for horizon in HORIZONS]
+    steps = [max(1, round(horizon / dt)) for horizon in HORIZONS]
     starts = np.arange(round(_BEGIN / dt), len(readings.t) - max(steps), max(1, round(_STARTS / dt)))
     restarts = np.array(readings.restarts, dtype=int)
     starts = starts[[not ((restarts > i - _BEGIN / dt) & (restarts <= i + max(steps))).any() for i in starts]]
@@ -151,7 +151,7 @@ def predict(problem: Problem, z: np.ndarray, readings: Readings) -> Predictions:
                 with np.errstate(all="ignore"):
                     expected = np.stack(np.broadcast_arrays(*expected_readings(robot, readings.names, x, u)), axis=-1)
                 wrong = expected + lanes.bias[lane] - readings.y[starts + j + 1]
-                errors[lane, steps.index(j + 1)] = np.nanmedian(np.abs(wrong), axis=0)
+                errors[lane, np.array(steps) == j + 1] = np.nanmedian(np.abs(wrong), axis=0)
     constant = [np.nanmedian(np.abs(readings.y[starts + j] - readings.y[starts]), axis=0) for j in steps]
     groups = tuple(dict.fromkeys(map(group_of, readings.names)))
     members = [[i for i, name in enumerate(readings.names) if group_of(name) == group] for group in groups]
