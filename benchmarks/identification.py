@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.identification.checks import predict
+from ballbot_baselines.identification.checks import Predictions
 from ballbot_baselines.identification.identify import Identified, identify
-from ballbot_baselines.identification.likelihood import Readings, commanded
-from ballbot_baselines.identification.logs import Log, LogError, description_text, log_text, read_description, read_log
+from ballbot_baselines.identification.likelihood import Readings
+from ballbot_baselines.identification.logs import Log, LogError
 from ballbot_baselines.identification.record import Recorded, record
 from ballbot_gym import files, named_robot
 from ballbot_gym.robot import Ballbot
@@ -72,10 +72,7 @@ def dirty(readings: Readings, rng: np.random.Generator) -> Readings:
 def through_files(readings: Readings, robot: Ballbot) -> Log:
     """A log that was written and read again."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "log.csv"
-        path.write_text(log_text(readings))
-        path.with_suffix(".toml").write_text(description_text(readings))
-        return read_log(path, read_description(path.with_suffix(".toml"), robot), robot)
+        return Log.read(Log.write(readings, Path(folder) / "log.csv"), robot)
 
 
 def measure(robot: Ballbot, made: Recorded, readings: Readings) -> list[dict[str, Any]]:
@@ -98,7 +95,7 @@ def predictions(result: Identified, made: Recorded, log: Log) -> list[dict[str, 
     """Errors of predictions over 0.5 s of the identified robot, over those of the true one."""
     problem, n = result.found.problem, len(log.readings.t)
     z = problem.z_of(made.robot, made.delay, result.found.z)
-    true = predict(problem, z[None], log.readings.between(round(0.75 * n), n))
+    true = Predictions.of(problem, z[None], log.readings.between(round(0.75 * n), n))
     ratios = result.predictions.errors[:, :, 1] / true.errors[0, :, 1]
     nominal, identified = np.exp(np.log(ratios).mean(axis=1))
     return [row_of("prediction error of the nominal robot", nominal, 1.0), row_of("prediction error", identified, 1.0)]
@@ -106,7 +103,7 @@ def predictions(result: Identified, made: Recorded, log: Log) -> list[dict[str, 
 
 def sign_is_named(robot: Ballbot, readings: Readings, rng: np.random.Generator) -> float:
     """1 if a column whose sign is wrong is named, else 0."""
-    columns = [*readings.names, *commanded(robot)]
+    columns = [*readings.names, *Readings.commanded(robot)]
     i = int(rng.integers(len(columns)))
     y, commands = readings.y.copy(), readings.commands.copy()
     (y if i < y.shape[1] else commands)[:, i % y.shape[1] if i >= y.shape[1] else i] *= -1

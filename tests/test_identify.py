@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballbot_baselines.identification.checks import predict
-from ballbot_baselines.identification.estimate import Problem, information, most_likely
+from ballbot_baselines.identification.checks import Predictions
+from ballbot_baselines.identification.estimate import Problem
 from ballbot_baselines.identification.identify import identify
-from ballbot_baselines.identification.likelihood import Readings, commanded, innovations, readable
-from ballbot_baselines.identification.logs import Log, LogError, description_text, log_text, read_description, read_log
-from ballbot_baselines.identification.record import Recorded, Waves, record, still
+from ballbot_baselines.identification.likelihood import Innovations, Readings
+from ballbot_baselines.identification.logs import Log, LogError
+from ballbot_baselines.identification.record import Recorded, Waves, record
 from ballbot_gym import Randomization, named_robot
 from ballbot_gym.robot import Ballbot, read_urdf
 from ballbot_train.commands.identify import identify as command
@@ -44,9 +44,7 @@ def readings(recorded: Recorded) -> Readings:
 
 def written(readings: Readings, folder: Path, robot: Ballbot = ROBOT) -> Log:
     """A log that went through its files."""
-    (folder / "log.csv").write_text(log_text(readings))
-    (folder / "log.toml").write_text(description_text(readings))
-    return read_log(folder / "log.csv", read_description(folder / "log.toml", robot), robot)
+    return Log.read(Log.write(readings, folder / "log.csv"), robot)
 
 
 def changed(readings: Readings, name: str, factor: float) -> Readings:
@@ -55,7 +53,7 @@ def changed(readings: Readings, name: str, factor: float) -> Readings:
     if name in readings.names:
         y[:, readings.names.index(name)] *= factor
     else:
-        commands[:, commanded(ROBOT).index(name)] *= factor
+        commands[:, Readings.commanded(ROBOT).index(name)] *= factor
     return replace(readings, y=y, commands=commands)
 
 
@@ -91,7 +89,7 @@ def test_a_log_determines_the_robot_and_its_delay(recorded: Recorded, tmp_path: 
 def test_a_log_does_not_separate_masses_from_the_strength_of_the_drive(recorded: Recorded) -> None:
     """All masses, all inertias and the forces times one factor move the robot the same way."""
     problem = Problem(ROBOT, recorded.readings.names)
-    _, _, h = information(problem, [recorded.readings], np.zeros(len(problem.parameters)))
+    _, _, h = problem.information([recorded.readings], np.zeros(len(problem.parameters)))
     scale = np.zeros(len(h))
     for i, each in enumerate(problem.parameters):
         if each.name in ("body_mass", "ball_mass", "inertia", "axial_inertia", "force_limit"):
@@ -110,7 +108,7 @@ def test_innovations_of_the_true_robot_are_as_large_as_expected(recorded: Record
         if each.name.endswith("drift"):
             z[i] = np.log(1e-3 / each.nominal) / each.spread
     z = problem.z_of(recorded.robot, recorded.delay, z)
-    found = innovations(ROBOT, recorded.readings, problem.lanes(z[None]))
+    found = Innovations.of(ROBOT, recorded.readings, problem.lanes(z[None]))
     squares = (found.missed**2 / found.variance)[200:, 0]  # after the leans' biases, which are not given, were found
     rates = [i for i, name in enumerate(recorded.readings.names) if not name.startswith("lean_")]
     # the mean of 1800 squares of standard normal numbers has a standard deviation of 0.033
@@ -121,9 +119,9 @@ def test_the_slope_of_the_likelihood_is_that_of_its_values(readings: Readings) -
     problem = Problem(ROBOT, readings.names, KNOWN)
     part = readings.between(0, 300)
     z, step = np.full(len(problem.parameters), 0.1), 1e-3
-    _, slope, _ = information(problem, [part], z)
+    _, slope, _ = problem.information([part], z)
     for i in range(len(z)):
-        (up, *_), (down, *_) = (information(problem, [part], z + sign * step * np.eye(len(z))[i]) for sign in (1, -1))
+        (up, *_), (down, *_) = (problem.information([part], z + sign * step * np.eye(len(z))[i]) for sign in (1, -1))
         assert slope[i] == pytest.approx((up - down) / (2 * step), rel=0.02, abs=0.5)
 
 
@@ -131,7 +129,7 @@ def test_predictions_of_a_slow_log_are_of_the_next_reading_at_least(readings: Re
     t, y, commands = (each[::50] for each in (readings.t, readings.y, readings.commands))
     problem = Problem(ROBOT, readings.names)
     z = np.zeros((1, len(problem.parameters)))
-    found = predict(problem, z, replace(readings, t=t, y=y, commands=commands))
+    found = Predictions.of(problem, z, replace(readings, t=t, y=y, commands=commands))
     assert found.horizons[:2] == (0.1, 0.5)  # of a log with a reading every 0.5 s
     np.testing.assert_array_equal(found.errors[..., 0], found.errors[..., 1])
     np.testing.assert_array_equal(found.constant[:, 0], found.constant[:, 1])
@@ -157,7 +155,7 @@ def test_commands_that_are_glitches_are_guessed_and_their_forces_uncertain(readi
     assert log.commands[800, 0] == pytest.approx(readings.commands[799:802, 0].mean(), abs=1.0)
     problem = Problem(ROBOT, log.names)
     lanes = problem.lanes(np.zeros((1, len(problem.parameters))))
-    sure, unsure = (innovations(ROBOT, replace(log, guessed=each), lanes).variance for each in (None, log.guessed))
+    sure, unsure = (Innovations.of(ROBOT, replace(log, guessed=each), lanes).variance for each in (None, log.guessed))
     speed = log.names.index("speed_x")
     assert unsure[802, 0, speed] > sure[802, 0, speed]
 
@@ -169,7 +167,7 @@ def test_glitches_in_commands_do_not_move_the_delay(recorded: Recorded, tmp_path
     commands[hit] += 100 * rng.choice([-1, 1], hit.sum())
     log = written(replace(recorded.readings, commands=commands), tmp_path).readings
     problem = Problem(ROBOT, log.names, KNOWN)
-    found = {each.parameter.name: each.value for each in most_likely(problem, [log]).estimates}
+    found = {each.parameter.name: each.value for each in problem.most_likely([log]).estimates}
     assert found["delay"] == pytest.approx(recorded.delay, abs=0.003)
 
 
@@ -239,7 +237,7 @@ def test_a_plain_text_log_is_read_by_its_description_alone(tmp_path: Path) -> No
     rows = np.random.default_rng(0).integers(-100, 100, (600, 8))
     (tmp_path / "log.txt").write_text("# a robot\n" + "\n".join(" ".join(map(str, row)) for row in rows))
     (tmp_path / "log.toml").write_text(PLAIN)
-    log = read_log(tmp_path / "log.txt", read_description(tmp_path / "log.toml", omni), omni).readings
+    log = Log.read(tmp_path / "log.txt", omni).readings
     assert log.names == ("lean_x", "lean_y", "wheel_speed_1", "wheel_speed_2", "wheel_speed_3")
     assert log.delays == (0.01, 0.0, 0.0, 0.0, 0.0)
     factors = np.array([np.pi / 180, -np.pi / 180, 2 * np.pi / 60, 0.1, np.pi / 180])
@@ -292,7 +290,7 @@ unit = "rad"
 def test_a_description_that_is_wrong_says_why(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "log.toml").write_text(text)
     with pytest.raises(LogError, match=message):
-        read_description(tmp_path / "log.toml", ROBOT)
+        Log.read(tmp_path / "log.csv", ROBOT)
 
 
 ROWS = [f"{k / 100},{np.sin(k)},{np.cos(k)},{0.01 * np.sin(k / 9)}" for k in range(1000)]
@@ -317,7 +315,7 @@ def test_a_file_that_is_no_log_says_why(lines: list[str], message: str, tmp_path
     (tmp_path / "log.csv").write_text("\n".join(lines))
     (tmp_path / "log.toml").write_text(GOOD)
     with pytest.raises(LogError, match=message):
-        read_log(tmp_path / "log.csv", read_description(tmp_path / "log.toml", ROBOT), ROBOT)
+        Log.read(tmp_path / "log.csv", ROBOT)
 
 
 def test_rows_that_are_no_numbers_or_go_back_in_time_are_named(tmp_path: Path) -> None:
@@ -326,15 +324,15 @@ def test_rows_that_are_no_numbers_or_go_back_in_time_are_named(tmp_path: Path) -
     rows[200] = "0.1" + rows[200].removeprefix("2.0")
     (tmp_path / "log.csv").write_text("\n".join(["time,a,b,c", *rows]))
     (tmp_path / "log.toml").write_text(GOOD)
-    log = read_log(tmp_path / "log.csv", read_description(tmp_path / "log.toml", ROBOT), ROBOT)
+    log = Log.read(tmp_path / "log.csv", ROBOT)
     assert any("column 'c': 1 cell without a number, the first 'err' in row 51" in each for each in log.findings)
     assert any("the clock goes back in 1 row, the first row 201 at 0.100 s" in each for each in log.findings)
     assert len(log.readings.t) == 999
 
 
 def test_quantities_are_those_that_the_robot_has() -> None:
-    assert "heading" not in readable(ROBOT)
-    assert {"heading", "gyro_z", "wheel_angle_3"} <= set(readable(named_robot("omni")))  # pyright: ignore[reportArgumentType]
+    assert "heading" not in Readings.readable(ROBOT)
+    assert {"heading", "gyro_z", "wheel_angle_3"} <= set(Readings.readable(named_robot("omni")))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="unknown parameter 'mass'; known: 'body_mass', 'ball_mass'"):
         Problem(ROBOT, ("lean_x",), ("mass",))
 
@@ -386,11 +384,10 @@ def test_a_designed_motion_is_more_informative_than_balancing_within_its_limit_o
     motion = Waves(*(np.array(held[name]) for name in Waves._fields))
     moved = record(ROBOT, 5.0, motion, None, "rk4")
     assert moved.lean < 1.05 * np.radians(6.0)
-    still_made = record(ROBOT, 5.0, still, "noisy", "rk4")
+    still_made = record(ROBOT, 5.0, Waves.still(), "noisy", "rk4")
     problem = Problem(ROBOT, moved.readings.names, KNOWN)
     i = [each.name for each in problem.parameters].index("com_height")
     moving, balancing = (
-        information(problem, [each.readings], np.zeros(len(problem.parameters)))[2][i, i]
-        for each in (moved, still_made)
+        problem.information([each.readings], np.zeros(len(problem.parameters)))[2][i, i] for each in (moved, still_made)
     )
     assert moving > 16 * balancing  # a quarter of the deviation

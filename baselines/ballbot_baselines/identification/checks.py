@@ -6,15 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ballbot_baselines.identification.estimate import Problem, group_of
-from ballbot_baselines.identification.likelihood import (
-    Readings,
-    applied,
-    commanded,
-    expected_readings,
-    innovations,
-    rates_with_angles,
-)
+from ballbot_baselines.identification.estimate import Problem
+from ballbot_baselines.identification.likelihood import Innovations, Readings
 
 HORIZONS = (0.1, 0.5, 1.0)
 """How far ahead motions are predicted, s."""
@@ -49,58 +42,58 @@ class Suspect(NamedTuple):
     others: tuple[tuple[str, ...], ...]
     """Other columns: if they had this fault, that would explain the log nearly as well."""
 
+    @classmethod
+    def found(cls, problem: Problem, readings: Readings) -> "Suspect | None":
+        """The columns whose sign or unit is wrong; None where all are right.
 
-def suspect(problem: Problem, readings: Readings) -> Suspect | None:
-    """The columns whose sign or unit is wrong; None where all are right.
-
-    Raises:
-        ValueError: the robot explains the log with no sign or unit.
-
-    """
-    # The log is multiplied by factors, so its likelihood is that of the corrected log times the factors.
-    last = int(np.searchsorted(readings.t, readings.t[0] + _SECONDS))
-    part = readings.between(0, last)
-    columns = (*readings.names, *commanded(problem.robot))
-    suspicions = [_Suspicion((), 1.0), *_suspicions(columns)]
-    factors = np.array([[each.factor if name in each.names else 1.0 for name in columns] for each in suspicions])
-    lanes = problem.lanes(np.zeros((len(suspicions), len(problem.parameters))))
-    lanes = lanes._replace(noise=_LOUDER * lanes.noise, drift=_LOOSER * lanes.drift)
-    with np.errstate(all="ignore"):  # of filters that fail
-        found = innovations(problem.robot, part, lanes, factors)
-        fails = ~(np.isfinite(found.missed) & (found.variance > 0) & (found.variance < np.inf))
-        variance = np.where(fails, 1.0, found.variance)
-        misfit = np.where(fails, _MOST, np.minimum(found.missed**2 / variance, _MOST) + np.log(variance))
-    scores = -0.5 * misfit.sum(axis=(0, 2))
-    m = len(readings.names)
-    scores += np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
-    gains = scores - scores[0]
-    best = int(np.argmax(gains))
-    if misfit[:, best].mean() > _NONSENSE:
-        raise ValueError(
-            "the readings contradict each other and the commands, whatever their signs and units: this is no log of such a "
-            "robot, or its columns are something else"
+        Raises:
+            ValueError: the robot explains the log with no sign or unit.
+        """
+        # The log is multiplied by factors, so its likelihood is that of the corrected log times the factors.
+        last = int(np.searchsorted(readings.t, readings.t[0] + _SECONDS))
+        part = readings.between(0, last)
+        columns = (*readings.names, *Readings.commanded(problem.robot))
+        suspicions = [_Suspicion((), 1.0), *_suspicions(columns)]
+        factors = np.array([[each.factor if name in each.names else 1.0 for name in columns] for each in suspicions])
+        lanes = problem.lanes(np.zeros((len(suspicions), len(problem.parameters))))
+        lanes = lanes._replace(noise=_LOUDER * lanes.noise, drift=_LOOSER * lanes.drift)
+        with np.errstate(all="ignore"):  # of filters that fail
+            found = Innovations.of(problem.robot, part, lanes, factors)
+            fails = ~(np.isfinite(found.missed) & (found.variance > 0) & (found.variance < np.inf))
+            variance = np.where(fails, 1.0, found.variance)
+            misfit = np.where(fails, _MOST, np.minimum(found.missed**2 / variance, _MOST) + np.log(variance))
+        scores = -0.5 * misfit.sum(axis=(0, 2))
+        m = len(readings.names)
+        scores += np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
+        gains = scores - scores[0]
+        best = int(np.argmax(gains))
+        if misfit[:, best].mean() > _NONSENSE:
+            raise ValueError(
+                "the readings contradict each other and the commands, whatever their signs and units: this is no log of such "
+                "a robot, or its columns are something else"
+            )
+        if gains[best] < _CLEAR * last:
+            return None
+        near = [int(i) for i in np.flatnonzero(gains > _NEARLY * gains[best])]
+        first = min(near, key=lambda i: (len(suspicions[i].names), -gains[i]))
+        names, factor = suspicions[first]
+        others = tuple(
+            each.names
+            for each in (suspicions[i] for i in near)
+            if each.factor == factor and not set(names) & set(each.names)
         )
-    if gains[best] < _CLEAR * last:
-        return None
-    near = [int(i) for i in np.flatnonzero(gains > _NEARLY * gains[best])]
-    first = min(near, key=lambda i: (len(suspicions[i].names), -gains[i]))
-    names, factor = suspicions[first]
-    others = tuple(
-        each.names
-        for each in (suspicions[i] for i in near)
-        if each.factor == factor and not set(names) & set(each.names)
-    )
-    return Suspect(names, "has the wrong sign" if factor == -1 else _UNITS[factor], others)
+        return cls(names, "has the wrong sign" if factor == -1 else _UNITS[factor], others)
 
 
 def _suspicions(columns: tuple[str, ...]) -> Iterator[_Suspicion]:
+    kind_of = Readings.group_of
     groups: dict[tuple[str, ...], None] = {(name,): None for name in columns}
     for wanted in (
-        *(lambda name, kind=kind: group_of(name) == kind for kind in dict.fromkeys(map(group_of, columns))),
+        *(lambda name, kind=kind: kind_of(name) == kind for kind in dict.fromkeys(map(kind_of, columns))),
         *(lambda name, axis=axis: name in (f"lean_{axis}", f"lean_rate_{axis}") for axis in "xy"),
         *(lambda name, axis=axis: name in (f"position_{axis}", f"speed_{axis}") for axis in "xy"),
-        lambda name: group_of(name) in ("lean", "lean_rate", "gyro"),
-        lambda name: group_of(name) in ("position", "speed", "wheel_speed", "wheel_angle"),
+        lambda name: kind_of(name) in ("lean", "lean_rate", "gyro"),
+        lambda name: kind_of(name) in ("position", "speed", "wheel_speed", "wheel_angle"),
     ):
         groups[tuple(name for name in columns if wanted(name))] = None
     for names in filter(None, groups):
@@ -122,39 +115,32 @@ class Predictions(NamedTuple):
     constant: np.ndarray
     """(groups, horizons) of the prediction that nothing changes."""
 
+    @classmethod
+    def of(cls, problem: Problem, z: np.ndarray, readings: Readings) -> "Predictions":
+        """Errors of what B robots predict of a log from the states that their filters find, with the commands of the log.
 
-def predict(problem: Problem, z: np.ndarray, readings: Readings) -> Predictions:
-    """Errors of what B robots predict of a log from the states that their filters find, with the commands of the log.
-
-    Args:
-        problem: of the log.
-        z: (B, p) the robots, their drives and their sensors.
-        readings: a part of a log that was held back.
-    """
-    lanes, dt = problem.lanes(z), readings.dt
-    found, forces = innovations(problem.robot, readings, lanes), applied(readings, lanes)
-    steps = [max(1, round(horizon / dt)) for horizon in HORIZONS]
-    starts = np.arange(round(_BEGIN / dt), len(readings.t) - max(steps), max(1, round(_STARTS / dt)))
-    restarts = np.array(readings.restarts, dtype=int)
-    starts = starts[[not ((restarts > i - _BEGIN / dt) & (restarts <= i + max(steps))).any() for i in starts]]
-    errors = np.empty((len(z), len(HORIZONS), len(readings.names)))
-    for lane in range(len(z)):
-        values = {name: float(value[0]) for name, value in problem.values(z[lane : lane + 1]).items()}
-        robot = problem.robot_of(values)
-        rates = rates_with_angles(robot, readings.names)
-        x = tuple(found.states[starts, lane].T)
-        for j in range(max(steps)):
-            u = tuple(forces[starts + j, lane].T)
-            with np.errstate(all="ignore"):  # some robots fall beyond all bounds
-                x = robot.step(x, u, readings.t[starts + j + 1] - readings.t[starts + j], robot.substeps(dt), rates)
-            if j + 1 in steps:
-                with np.errstate(all="ignore"):
-                    expected = np.stack(np.broadcast_arrays(*expected_readings(robot, readings.names, x, u)), axis=-1)
-                wrong = expected + lanes.bias[lane] - readings.y[starts + j + 1]
-                errors[lane, np.array(steps) == j + 1] = np.nanmedian(np.abs(wrong), axis=0)
-    constant = [np.nanmedian(np.abs(readings.y[starts + j] - readings.y[starts]), axis=0) for j in steps]
-    groups = tuple(dict.fromkeys(map(group_of, readings.names)))
-    members = [[i for i, name in enumerate(readings.names) if group_of(name) == group] for group in groups]
-    together = [np.sqrt(np.mean(np.stack([*errors, constant])[..., own] ** 2, axis=-1)) for own in members]
-    *own, constant = np.stack(together, axis=1)
-    return Predictions(groups, HORIZONS, np.array(own), constant)
+        Args:
+            problem: of the log.
+            z: (B, p) the robots, their drives and their sensors.
+            readings: a part of a log that was held back.
+        """
+        lanes, dt = problem.lanes(z), readings.dt
+        found, forces = Innovations.of(problem.robot, readings, lanes), lanes.applied(readings)
+        steps = [max(1, round(horizon / dt)) for horizon in HORIZONS]
+        starts = np.arange(round(_BEGIN / dt), len(readings.t) - max(steps), max(1, round(_STARTS / dt)))
+        restarts = np.array(readings.restarts, dtype=int)
+        starts = starts[[not ((restarts > i - _BEGIN / dt) & (restarts <= i + max(steps))).any() for i in starts]]
+        errors = np.empty((len(z), len(HORIZONS), len(readings.names)))
+        for lane in range(len(z)):
+            values = {name: float(value[0]) for name, value in problem.values(z[lane : lane + 1]).items()}
+            robot = problem.robot_of(values)
+            later = readings.predicted(robot, found.states[starts, lane], forces[:, lane], starts, steps)
+            for i, step in enumerate(steps):
+                wrong = later[i] + lanes.bias[lane] - readings.y[starts + step]
+                errors[lane, i] = np.nanmedian(np.abs(wrong), axis=0)
+        constant = [np.nanmedian(np.abs(readings.y[starts + j] - readings.y[starts]), axis=0) for j in steps]
+        groups = tuple(dict.fromkeys(map(Readings.group_of, readings.names)))
+        members = [[i for i, name in enumerate(readings.names) if readings.group_of(name) == group] for group in groups]
+        together = [np.sqrt(np.mean(np.stack([*errors, constant])[..., own] ** 2, axis=-1)) for own in members]
+        *own, constant = np.stack(together, axis=1)
+        return cls(groups, HORIZONS, np.array(own), constant)

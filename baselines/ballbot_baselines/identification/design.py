@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from ballbot_baselines.identification.estimate import Problem, information
-from ballbot_baselines.identification.record import Recorded, Waves, driving, record, recorded_names, still
+from ballbot_baselines.identification.estimate import Problem
+from ballbot_baselines.identification.record import Recorded, Waves, record
 from ballbot_gym.robot import Ballbot
 
 _PERIOD = 20.0  # s
@@ -25,7 +25,7 @@ _MOST_GROWTH = 20.0  # at once
 _SCALINGS = 3
 
 
-class Designed(NamedTuple):
+class _Designed(NamedTuple):
     """A motion, and the standard deviations that a log of it leaves."""
 
     motion: Waves
@@ -50,7 +50,7 @@ def design(
     max_lean: float = math.radians(8),
     known: tuple[str, ...] = (),
     watch: Callable[[int, int], object] = lambda done, total: None,
-) -> Designed:
+) -> _Designed:
     """The motion that makes the volume of the intervals smallest.
 
     Args:
@@ -59,8 +59,13 @@ def design(
         max_lean: rad.
         known: same as in `Problem`.
         watch: called with the number of frequencies that are done, and that of all.
+
+    Returns:
+        motion, its greatest lean in rad, the names of the p parameters of robot and drive, their standard deviations (p,)
+        after a log of the motion, in spreads of the prior, and those after balancing (p,). `ratio` compares the two.
     """
-    problem, count = Problem(robot, recorded_names(robot), known), len(_PERIODS)
+    balancing = record(robot, seconds, Waves.still(), None if robot.SENSORS else "noisy", "rk4")
+    problem, count = Problem(robot, balancing.readings.names, known), len(_PERIODS)
     sizes, alone = np.zeros(count), []
     for i, share in enumerate(np.eye(count)):
         motion, made = _at_limit(robot, _FIRST * share, seconds, max_lean)
@@ -69,10 +74,9 @@ def design(
         watch(i + 1, count)
     shares = _best_shares(np.array(alone))
     motion, made = _at_limit(robot, sizes * np.sqrt(shares), seconds, max_lean)
-    balancing = record(robot, seconds, still, None if robot.SENSORS else "noisy", "rk4")
     of = [i for i, each in enumerate(problem.parameters) if each.unit]
     deviations = [_deviations(_information(problem, each))[of] for each in (made, balancing)]
-    return Designed(motion, made.lean, tuple(problem.parameters[i].name for i in of), *deviations)
+    return _Designed(motion, made.lean, tuple(problem.parameters[i].name for i in of), *deviations)
 
 
 def _at_limit(robot: Ballbot, sizes: np.ndarray, seconds: float, max_lean: float) -> tuple[Waves, Recorded]:
@@ -90,14 +94,15 @@ def _circles(sizes: np.ndarray, robot: Ballbot) -> Waves:
     order = np.arange(len(sizes))
     phases = -math.pi * order * (order - 1) / max(np.count_nonzero(sizes), 1)
     quarter = math.pi / 2 * (-1.0) ** order
-    turns = driving(robot, np.random.default_rng(0)).amplitudes[2, 0] * np.ones(len(sizes)) / math.sqrt(len(sizes))
+    turn = Waves.driving(robot, np.random.default_rng(0)).amplitudes[2, 0]
+    turns = turn * np.ones(len(sizes)) / math.sqrt(len(sizes))
     return Waves(
         np.array([sizes, sizes, turns]), np.array(_PERIODS) / _PERIOD, np.array([phases, phases + quarter, phases])
     )
 
 
 def _information(problem: Problem, made: Recorded) -> np.ndarray:
-    return information(problem, [made.readings], np.zeros(len(problem.parameters)))[2]
+    return problem.information([made.readings], np.zeros(len(problem.parameters)))[2]
 
 
 def _deviations(h: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.optimize
 
-from ballbot_baselines.identification.likelihood import Innovations, Lanes, Readings, innovations, numbers_of
+from ballbot_baselines.identification.likelihood import Innovations, Lanes, Readings
 from ballbot_gym.robot import Ballbot
 
 _SPREADS = {
@@ -45,7 +45,7 @@ _DETERMINED = 0.25  # the log determines a parameter if it narrows the prior's i
 _WITHIN_95 = 1.96
 
 
-class Parameter(NamedTuple):
+class _Parameter(NamedTuple):
     """What is estimated."""
 
     name: str
@@ -60,10 +60,10 @@ class Parameter(NamedTuple):
         return self.nominal * np.exp(self.spread * z) if self.positive else self.nominal + self.spread * z
 
 
-class Estimate(NamedTuple):
+class _Estimate(NamedTuple):
     """A parameter as a log determines it."""
 
-    parameter: Parameter
+    parameter: _Parameter
     value: float
     low: float
     high: float
@@ -72,7 +72,7 @@ class Estimate(NamedTuple):
     """Whether the log determines it, and not the prior alone."""
 
 
-class Direction(NamedTuple):
+class _Direction(NamedTuple):
     """A combination of parameters, with the information of the log about it compared with that of the prior."""
 
     eigenvalue: float
@@ -101,30 +101,33 @@ class Problem:
             raise ValueError(f"unknown parameter {unknown[0]!r}; known: {', '.join(map(repr, every))}")
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """All that are estimated."""
+    def parameters(self) -> tuple[_Parameter, ...]:
+        """All that are estimated: each has its name, its unit, its nominal value, the spread of its prior, and `value(z)`.
+
+        The spread is the standard deviation: of the logarithm for a number that is positive, and in its unit for others.
+        """
         return tuple(each for each in self._all_parameters() if each.name not in self.known)
 
-    def _all_parameters(self) -> list[Parameter]:
+    def _all_parameters(self) -> list[_Parameter]:
         robot = [
-            Parameter(name, _UNITS[name], attrgetter(name)(self.robot), spread, positive=True)
+            _Parameter(name, _UNITS[name], attrgetter(name)(self.robot), spread, positive=True)
             for name, spread in _SPREADS.items()
             if "." not in name or name.partition(".")[0] in self.robot.PARTS
         ]
         drive = [
-            Parameter("delay", "s", 0.0, _DELAY, positive=False),
-            Parameter("lag", "s", _LAG, _LAG_SPREAD, positive=True),
+            _Parameter("delay", "s", 0.0, _DELAY, positive=False),
+            _Parameter("lag", "s", _LAG, _LAG_SPREAD, positive=True),
         ]
         biases = [
-            Parameter(f"{name} bias", "", 0.0, _BIASES[group_of(name)], positive=False)
+            _Parameter(f"{name} bias", "", 0.0, _BIASES[Readings.group_of(name)], positive=False)
             for name in self.names
-            if group_of(name) in _BIASES
+            if Readings.group_of(name) in _BIASES
         ]
         noises = [
-            Parameter(f"{name} noise", "", _NOISES[name], _NOISE_SPREAD, positive=True)
-            for name in dict.fromkeys(map(group_of, self.names))
+            _Parameter(f"{name} noise", "", _NOISES[name], _NOISE_SPREAD, positive=True)
+            for name in dict.fromkeys(map(Readings.group_of, self.names))
         ]
-        drifts = [Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in _DRIFTS.items()]
+        drifts = [_Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in _DRIFTS.items()]
         return [each for each in [*robot, *drive, *biases, *noises, *drifts] if each.nominal > 0 or not each.positive]
 
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
@@ -157,17 +160,58 @@ class Problem:
     def lanes(self, z: np.ndarray) -> Lanes:
         """The lanes of z (B, p)."""
         values = self.values(z)
-        numbers = np.stack([np.broadcast_to(number, len(z)) for number in numbers_of(self.robot_of(values))], axis=1)
-        none = np.zeros(len(z))
+        numbers, none = Lanes.numbers_of(self.robot_of(values)), np.zeros(len(z))
         return Lanes(
-            numbers,
+            np.stack([np.broadcast_to(number, len(z)) for number in numbers], axis=1),
             values["force_limit"] / self.robot.force_limit,
             values["delay"],
             values["lag"],
             np.stack([values.get(f"{name} bias", none) for name in self.names], axis=1),
-            np.stack([values[f"{group_of(name)} noise"] for name in self.names], axis=1),
+            np.stack([values[f"{Readings.group_of(name)} noise"] for name in self.names], axis=1),
             np.stack([np.hypot(values[name], _LEAST_DRIFT) for name in _DRIFTS], axis=1),
         )
+
+    def information(self, logs: list[Readings], z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """The negative log-likelihood of logs at z (p,), its slope (p,), and their Fisher information (p, p).
+
+        With the innovations ν and their variances S of all readings, H = Σ ν' ν'ᵀ / S + ½ S' S'ᵀ / S². The derivatives ν' and
+        S' are central differences.
+        """
+        count = len(z)
+        around = z + _DIFFERENCE * np.vstack([np.zeros((1, count)), np.eye(count), -np.eye(count)])
+        value, slope, curvature = 0.0, np.zeros(count), np.zeros((count, count))
+        for log in logs:
+            with np.errstate(all="ignore"):  # of filters that fail
+                found = Innovations.of(self.robot, log, self.lanes(around))
+            missed, variance, moved, widened = _differences(found, count)
+            scale = 1 / np.sqrt(variance)
+            first, second = moved * scale[:, None], widened / variance[:, None]
+            value += 0.5 * float(np.sum(np.log(variance) + missed**2 / variance))
+            slope += np.einsum("npm,nm->p", first, missed * scale)
+            slope += 0.5 * np.einsum("npm,nm->p", second, 1 - missed**2 / variance)
+            for weight, part in ((1.0, first), (0.5, second)):
+                flat = part.transpose(1, 0, 2).reshape(count, -1)
+                curvature += weight * flat @ flat.T
+        if not (np.isfinite(value) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
+            return np.inf, np.zeros(count), np.eye(count)
+        return value, slope, curvature
+
+    def most_likely(self, logs: list[Readings], watch: Callable[[int], object] = lambda done: None) -> "Found":
+        """The most likely parameters of logs with the same readings.
+
+        Readings whose innovations are too large to be noise are left out, and the estimate is repeated from where it was.
+
+        Args:
+            logs: one or more of them.
+            watch: called with the number of times that the likelihood was computed.
+
+        Raises:
+            ValueError: the logs are so far from what the robot can do that the filter fails.
+        """
+        z, _, rounds = _minimum(self, logs, np.zeros(len(self.parameters)), watch, 0)
+        kept, outliers = zip(*[_without_outliers(self, log, z) for log in logs], strict=True)
+        z, found, rounds = _minimum(self, list(kept), z, watch, rounds)
+        return Found(self, z, found, rounds, sum(outliers))
 
 
 _UNITS = {
@@ -175,11 +219,6 @@ _UNITS = {
     "force_limit": "N", "wheels.no_load_speed": "rad/s", "wheels.inertia": "kg·m²", "wheels.damping": "N·m·s",
     "wheels.spin_friction": "N·m",
 }  # fmt: skip
-
-
-def group_of(name: str) -> str:
-    """The kind of a quantity, whose sensors have one noise: "lean" of "lean_x"."""
-    return name[:-2]
 
 
 @dataclass(frozen=True)
@@ -214,11 +253,11 @@ class Found:
         )
 
     @property
-    def estimates(self) -> list[Estimate]:
-        """Every parameter with its interval."""
+    def estimates(self) -> list[_Estimate]:
+        """Every parameter with its value, the ends low and high of its 95 % interval, and whether the log determines it."""
         deviations = np.sqrt(np.diag(self.covariance))
         return [
-            Estimate(
+            _Estimate(
                 each,
                 *(float(each.value(z + step * deviation)) for step in (0.0, -_WITHIN_95, _WITHIN_95)),
                 determined=bool(deviation < _DETERMINED),
@@ -227,8 +266,11 @@ class Found:
         ]
 
     @property
-    def directions(self) -> list[Direction]:
-        """The combinations of parameters about which the prior has more information than the log, the least first."""
+    def directions(self) -> list[_Direction]:
+        """The combinations of parameters about which the prior has more information than the log, the least first.
+
+        Each has the eigenvalue of the log's information, compared with that of the prior, and the largest shares by name.
+        """
         eigenvalues, vectors = np.linalg.eigh(self.information)
         names = [each.name for each in self.problem.parameters]
         found = []
@@ -237,27 +279,8 @@ class Found:
                 vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
                 order = np.argsort(-np.abs(vector))
                 shares = {names[i]: float(vector[i]) for i in order if abs(vector[i]) > 0.25}
-                found.append(Direction(float(max(value, 0.0)), shares))
+                found.append(_Direction(float(max(value, 0.0)), shares))
         return found
-
-
-def most_likely(problem: Problem, logs: list[Readings], watch: Callable[[int], object] = lambda done: None) -> Found:
-    """The most likely parameters of logs with the same readings.
-
-    Readings whose innovations are too large to be noise are left out, and the estimate is repeated from where it was.
-
-    Args:
-        problem: what is estimated.
-        logs: one or more of them.
-        watch: called with the number of times that the likelihood was computed.
-
-    Raises:
-        ValueError: the logs are so far from what the robot can do that the filter fails.
-    """
-    z, _, rounds = _minimum(problem, logs, np.zeros(len(problem.parameters)), watch, 0)
-    kept, outliers = zip(*[_without_outliers(problem, log, z) for log in logs], strict=True)
-    z, found, rounds = _minimum(problem, list(kept), z, watch, rounds)
-    return Found(problem, z, found, rounds, sum(outliers))
 
 
 def _minimum(
@@ -269,7 +292,7 @@ def _minimum(
     def at(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         key = z.tobytes()
         if key not in known:
-            value, slope, curvature = information(problem, logs, z)
+            value, slope, curvature = problem.information(logs, z)
             known[key] = value + 0.5 * float(z @ z), slope + z, curvature + np.eye(len(z))
             watch(rounds + len(known))
         return known[key]
@@ -293,35 +316,9 @@ def _minimum(
 
 def _without_outliers(problem: Problem, log: Readings, z: np.ndarray) -> tuple[Readings, int]:
     """A log without readings that are too far from what the robot z (p,) predicts, and how many those are."""
-    found = innovations(problem.robot, log, problem.lanes(z[None]))
+    found = Innovations.of(problem.robot, log, problem.lanes(z[None]))
     far = found.missed[:, 0] ** 2 > _OUTLIER**2 * found.variance[:, 0]
     return replace(log, y=np.where(far, np.nan, log.y)), int(far.sum())
-
-
-def information(problem: Problem, logs: list[Readings], z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The negative log-likelihood of logs at z (p,), its slope (p,), and their Fisher information (p, p).
-
-    With the innovations ν and their variances S of all readings, H = Σ ν' ν'ᵀ / S + ½ S' S'ᵀ / S². The derivatives ν' and
-    S' are central differences.
-    """
-    count = len(z)
-    around = z + _DIFFERENCE * np.vstack([np.zeros((1, count)), np.eye(count), -np.eye(count)])
-    value, slope, curvature = 0.0, np.zeros(count), np.zeros((count, count))
-    for log in logs:
-        with np.errstate(all="ignore"):  # of filters that fail
-            found = innovations(problem.robot, log, problem.lanes(around))
-        missed, variance, moved, widened = _differences(found, count)
-        scale = 1 / np.sqrt(variance)
-        first, second = moved * scale[:, None], widened / variance[:, None]
-        value += 0.5 * float(np.sum(np.log(variance) + missed**2 / variance))
-        slope += np.einsum("npm,nm->p", first, missed * scale)
-        slope += 0.5 * np.einsum("npm,nm->p", second, 1 - missed**2 / variance)
-        for weight, part in ((1.0, first), (0.5, second)):
-            flat = part.transpose(1, 0, 2).reshape(count, -1)
-            curvature += weight * flat @ flat.T
-    if not (np.isfinite(value) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
-        return np.inf, np.zeros(count), np.eye(count)
-    return value, slope, curvature
 
 
 def _differences(found: Innovations, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballbot_baselines.identification.checks import Predictions, predict, suspect
-from ballbot_baselines.identification.estimate import Found, Problem, most_likely
+from ballbot_baselines.identification.checks import Predictions, Suspect
+from ballbot_baselines.identification.estimate import Found, Problem
 from ballbot_baselines.identification.logs import Log, LogError
 from ballbot_gym.robot import Ballbot
 
@@ -40,7 +40,7 @@ def identify(
         robot: the nominal one.
         logs: one or more.
         known: names of parameters that are held at the nominal values, because they were measured otherwise.
-        watch: same as in `most_likely`.
+        watch: same as in `Problem.most_likely`.
 
     Raises:
         LogError: a column has the wrong sign or unit, or the robot does not explain the log.
@@ -54,10 +54,10 @@ def identify(
     for log in logs:
         _check(problem, log)
     cuts = [round((1 - _HELD_BACK) * len(log.readings.t)) for log in logs]
-    found = most_likely(problem, [log.readings.between(0, cut) for log, cut in zip(logs, cuts, strict=True)], watch)
+    found = problem.most_likely([log.readings.between(0, cut) for log, cut in zip(logs, cuts, strict=True)], watch)
     held = [log.readings.between(cut, len(log.readings.t)) for log, cut in zip(logs, cuts, strict=True)]
     lanes = np.stack([problem.z_of(robot, 0.0, found.z), found.z])
-    every = [predict(problem, lanes, readings) for readings in held]
+    every = [Predictions.of(problem, lanes, readings) for readings in held]
     predictions = _mean(every)
     errors = predictions.errors[1, :, 0] / predictions.constant[:, 0]
     if np.exp(np.mean(np.log(errors))) > _BETTER:
@@ -80,7 +80,7 @@ def identify(
 def _check(problem: Problem, log: Log) -> None:
     """Raises a LogError that names columns with a wrong sign or unit."""
     try:
-        wrong = suspect(problem, log.readings)
+        wrong = Suspect.found(problem, log.readings)
     except ValueError as error:
         raise LogError(f"{log.path}: {error}") from None
     if wrong is None:

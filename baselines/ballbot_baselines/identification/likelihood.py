@@ -34,29 +34,12 @@ _READINGS = {
     "wheel_speed_1": "rad/s", "wheel_speed_2": "rad/s", "wheel_speed_3": "rad/s",
 }  # fmt: skip
 _ANGLES = {"wheel_angle_1": "rad", "wheel_angle_2": "rad", "wheel_angle_3": "rad"}
-QUANTITIES = _STATES | _READINGS | _ANGLES
-"""Every quantity that a log may have, with its unit."""
-COMMANDS = {2: ("command_x", "command_y"), 3: ("command_1", "command_2", "command_3")}
+_COMMANDS = {2: ("command_x", "command_y"), 3: ("command_1", "command_2", "command_3")}
 """Names of the commands of robots by their number of actuators."""
 _POSES = {0, 1, 2, 3, 8}  # components of a state without noise of their own: their rates have it
 _START = np.array([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.5, 0.5, 0.1, 0.5, 0.5])
 """Standard deviation of each component of a state that is not read, before the first reading, SI units."""
 _MANY = 8000  # operations of a function on which the compiler would spend minutes with all optimizations
-
-
-def readable(robot: Ballbot) -> dict[str, str]:
-    """The quantities that a log of a robot may have, by name, with their units.
-
-    `lean_x` is γ and `lean_y` is θ, so a positive lean is towards positive x or y. `gyro` and `accel` are in the body's
-    axes at its centre of mass, as `ballbot_gym.robot.sensors` describes them; they and the wheels are for robots with wheels.
-    """
-    states = dict(list(_STATES.items())[: robot.state_size])
-    return states | (_READINGS | _ANGLES if robot.SENSORS else {})
-
-
-def commanded(robot: Ballbot) -> tuple[str, ...]:
-    """Names of the commands of a robot: of the force on the ball along x and y, or of each wheel."""
-    return COMMANDS[robot.action_size]
 
 
 @dataclass(frozen=True)
@@ -65,7 +48,7 @@ class Readings:
 
     | field | shape | meaning |
     |---|---|---|
-    | names | m | what is read, see `readable` |
+    | names | m | what is read, see `Readings.readable` |
     | t | (n,) | s, growing |
     | y | (n, m) | readings; NaN where there is none |
     | commands | (n, k) | in units of the robot's action, each from its time until the next |
@@ -82,6 +65,27 @@ class Readings:
     restarts: tuple[int, ...] = ()
     guessed: np.ndarray | None = None
 
+    @staticmethod
+    def readable(robot: Ballbot) -> dict[str, str]:
+        """The quantities that a log of a robot may have, by name, with their units.
+
+        `lean_x` is γ and `lean_y` is θ, so a positive lean is towards positive x or y. `gyro` and `accel` are in the body's
+        axes at its centre of mass, as `ballbot_gym.robot.sensors` describes them; they and the wheels are for robots with
+        wheels.
+        """
+        states = dict(list(_STATES.items())[: robot.state_size])
+        return states | (_READINGS | _ANGLES if robot.SENSORS else {})
+
+    @staticmethod
+    def commanded(robot: Ballbot) -> tuple[str, ...]:
+        """Names of the commands of a robot: of the force on the ball along x and y, or of each wheel."""
+        return _COMMANDS[robot.action_size]
+
+    @staticmethod
+    def group_of(name: str) -> str:
+        """The kind of a quantity, whose sensors have one noise: "lean" of "lean_x"."""
+        return name[:-2]
+
     def between(self, first: int, last: int) -> "Readings":
         """The readings from index `first` until before `last`."""
         cut, restarts = slice(first, last), tuple(i - first for i in self.restarts if first < i < last)
@@ -93,12 +97,40 @@ class Readings:
         """The median time between two readings, s."""
         return float(np.median(np.diff(self.t)))
 
+    @property
+    def units(self) -> dict[str, str]:
+        """The SI units of readings and commands by name."""
+        every, commands = _STATES | _READINGS | _ANGLES, _COMMANDS[self.commands.shape[1]]
+        return {name: every[name] for name in self.names} | dict.fromkeys(commands, "N")
+
+    def predicted(
+        self, robot: Ballbot, x: np.ndarray, forces: np.ndarray, starts: np.ndarray, steps: list[int]
+    ) -> np.ndarray:
+        """(len(steps), s, m) what perfect sensors without a bias read later, by the equations of motion alone.
+
+        Args:
+            robot: whose equations they are.
+            x: (s, ...) states of its filter at the starts.
+            forces: (n, k) that it applies, N.
+            starts: (s,) indices of readings.
+            steps: numbers of readings after the starts, at least 1.
+        """
+        rates, state, later = _rates_with_angles(robot, self.names), tuple(x.T), {}
+        for j in range(max(steps)):
+            u, dt = tuple(forces[starts + j].T), self.t[starts + j + 1] - self.t[starts + j]
+            with np.errstate(all="ignore"):  # some robots fall beyond all bounds
+                state = robot.step(state, u, dt, robot.substeps(self.dt), rates)
+                if j + 1 in steps:
+                    expected = _expected_readings(robot, self.names, state, u)
+                    later[j + 1] = np.stack(np.broadcast_arrays(*expected), axis=-1)
+        return np.stack([later[each] for each in steps])
+
 
 class Lanes(NamedTuple):
     """B sets of numbers."""
 
     numbers: np.ndarray
-    """(B, ...) of the robots, see `numbers_of`."""
+    """(B, ...) of the robots, see `Lanes.numbers_of`."""
     strength: np.ndarray
     """(B,) ratio of the applied force to the command."""
     delay: np.ndarray
@@ -112,6 +144,31 @@ class Lanes(NamedTuple):
     drift: np.ndarray
     """(B, 2) standard deviation of what is added to speeds and to turning rates in a second, m/s and rad/s."""
 
+    @staticmethod
+    def numbers_of(robot: Ballbot) -> list[float]:
+        """The numbers of a robot that filters compute with."""
+        return [*robot.numbers(), *(getattr(robot, name) for name in robot.SENSORS)]
+
+    def applied(self, readings: Readings) -> np.ndarray:
+        """(n, B, k) the force that the lanes apply from each time of a log to the next.
+
+        It is the mean of the delayed command over that time, followed with a first-order lag as `Randomization.actuate` has
+        it.
+        """
+        t, commands = readings.t, readings.commands
+        ends = np.append(t, t[-1] + readings.dt)
+        total = np.concatenate([np.zeros((1, commands.shape[1])), np.cumsum(commands * np.diff(ends)[:, None], axis=0)])
+        before = ends[:, None] - self.delay  # (n + 1, B)
+        sums = np.stack([np.interp(before, ends, column) for column in total.T], axis=-1)
+        # the first command is taken for those before
+        early = np.minimum(before - ends[0], 0.0)[..., None] * commands[0]
+        late = np.maximum(before - ends[-1], 0.0)[..., None] * commands[-1]
+        forces = np.diff(sums + early + late, axis=0) / np.diff(ends)[:, None, None]
+        share = 1 - np.exp(-np.diff(ends)[:, None] / np.maximum(self.lag, 1e-9))
+        for i in range(1, len(forces)):
+            forces[i] = forces[i - 1] + share[i][:, None] * (forces[i] - forces[i - 1])
+        return forces * self.strength[:, None]
+
 
 class Innovations(NamedTuple):
     """What the filters of B lanes found."""
@@ -123,85 +180,57 @@ class Innovations(NamedTuple):
     states: np.ndarray
     """(n, B, s) the states, after the readings of their time."""
 
-    def log_likelihood(self) -> np.ndarray:
-        """(B,), without the constant −½ ln 2π for each reading."""
-        return -0.5 * np.sum(np.log(self.variance) + self.missed**2 / self.variance, axis=(0, 2))
+    @classmethod
+    def of(cls, robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.ndarray | None = None) -> "Innovations":
+        """Runs the filters of B lanes over a log.
 
-
-def numbers_of(robot: Ballbot) -> list[float]:
-    """The numbers of a robot that filters compute with."""
-    return [*robot.numbers(), *(getattr(robot, name) for name in robot.SENSORS)]
-
-
-def applied(readings: Readings, lanes: Lanes) -> np.ndarray:
-    """(n, B, k) the force that B lanes apply from each time of a log to the next.
-
-    It is the mean of the delayed command over that time, followed with a first-order lag as `Randomization.actuate` has it.
-    """
-    t, commands = readings.t, readings.commands
-    ends = np.append(t, t[-1] + readings.dt)
-    total = np.concatenate([np.zeros((1, commands.shape[1])), np.cumsum(commands * np.diff(ends)[:, None], axis=0)])
-    before = ends[:, None] - lanes.delay  # (n + 1, B)
-    sums = np.stack([np.interp(before, ends, column) for column in total.T], axis=-1)
-    early = np.minimum(before - ends[0], 0.0)[..., None] * commands[0]  # the first command is taken for those before
-    late = np.maximum(before - ends[-1], 0.0)[..., None] * commands[-1]
-    forces = np.diff(sums + early + late, axis=0) / np.diff(ends)[:, None, None]
-    share = 1 - np.exp(-np.diff(ends)[:, None] / np.maximum(lanes.lag, 1e-9))
-    for i in range(1, len(forces)):
-        forces[i] = forces[i - 1] + share[i][:, None] * (forces[i] - forces[i - 1])
-    return forces * lanes.strength[:, None]
-
-
-def innovations(robot: Ballbot, readings: Readings, lanes: Lanes, factors: np.ndarray | None = None) -> Innovations:
-    """Runs the filters of B lanes over a log.
-
-    Args:
-        robot: of the lanes' kind.
-        readings: of n times.
-        lanes: B of them.
-        factors: (B, m + k) on the readings and the commands; default, 1.
-    """
-    n, lane_count, m = len(readings.t), len(lanes.delay), len(readings.names)
-    step, size = _step(robot.kind, readings.names, readings.delays or (0.0,) * m, robot.substeps(readings.dt))
-    packed = size + size * (size + 1) // 2
-    calls = -(-lane_count // LANES)
-    count = calls * LANES
-    factors = np.ones((lane_count, m + readings.commands.shape[1])) if factors is None else factors
-    forces, y = applied(readings, lanes) * factors[:, m:], readings.y[:, None, :] * factors[:, :m]
-    uncertain = np.zeros_like(forces)
-    if readings.guessed is not None:
-        # variances and not deviations, whose sum over steps would depend on the delay
-        uncertain = applied(replace(readings, commands=readings.guessed**2), lanes) * lanes.strength[:, None]
-    used = np.isfinite(readings.y)
-    steps = np.zeros((n, count, 2 * m + 3 * forces.shape[2] + 1))
-    steps[:, :lane_count] = np.concatenate(
-        [
-            np.where(used[:, None, :], y, 0.0),
-            np.broadcast_to(used[:, None, :], y.shape),
-            np.concatenate([forces[:1], forces[:-1]]),
-            forces,
-            uncertain,
-            np.broadcast_to(
-                np.diff(readings.t, append=readings.t[-1] + readings.dt)[:, None, None], (n, lane_count, 1)
-            ),
-        ],
-        axis=-1,
-    )
-    constants = np.zeros((count, lanes.numbers.shape[1] + 2 * m + 2))
-    constants[:lane_count] = np.hstack([lanes.numbers, lanes.bias, lanes.noise**2, lanes.drift**2])
-    constants[lane_count:], steps[:, lane_count:] = constants[:1], steps[:, :1]  # what fills the last call
-    now, found = np.zeros_like(steps[0]), np.zeros((count, 2 * m + size))
-    pair = np.zeros((count, packed)), np.zeros((count, packed))
-    run = [InPlace(step.map(calls), [a, constants, now], [b, found]) for a, b in (pair, pair[::-1])]
-    every = np.empty((n, lane_count, 2 * m + size))
-    restarts = {0, *readings.restarts}
-    for i in range(n):
-        if i in restarts:
-            pair[i % 2][:] = _starts(readings, i, y, size, count)
-        now[:] = steps[i]
-        run[i % 2]()
-        every[i] = found[:lane_count]
-    return Innovations(every[..., :m], every[..., m : 2 * m], every[..., 2 * m :])
+        Args:
+            robot: of the lanes' kind.
+            readings: of n times.
+            lanes: B of them.
+            factors: (B, m + k) on the readings and the commands; default, 1.
+        """
+        n, lane_count, m = len(readings.t), len(lanes.delay), len(readings.names)
+        step, size = _step(robot.kind, readings.names, readings.delays or (0.0,) * m, robot.substeps(readings.dt))
+        packed = size + size * (size + 1) // 2
+        calls = -(-lane_count // LANES)
+        count = calls * LANES
+        factors = np.ones((lane_count, m + readings.commands.shape[1])) if factors is None else factors
+        forces, y = lanes.applied(readings) * factors[:, m:], readings.y[:, None, :] * factors[:, :m]
+        uncertain = np.zeros_like(forces)
+        if readings.guessed is not None:
+            # variances and not deviations, whose sum over steps would depend on the delay
+            uncertain = lanes.applied(replace(readings, commands=readings.guessed**2)) * lanes.strength[:, None]
+        used = np.isfinite(readings.y)
+        steps = np.zeros((n, count, 2 * m + 3 * forces.shape[2] + 1))
+        steps[:, :lane_count] = np.concatenate(
+            [
+                np.where(used[:, None, :], y, 0.0),
+                np.broadcast_to(used[:, None, :], y.shape),
+                np.concatenate([forces[:1], forces[:-1]]),
+                forces,
+                uncertain,
+                np.broadcast_to(
+                    np.diff(readings.t, append=readings.t[-1] + readings.dt)[:, None, None], (n, lane_count, 1)
+                ),
+            ],
+            axis=-1,
+        )
+        constants = np.zeros((count, lanes.numbers.shape[1] + 2 * m + 2))
+        constants[:lane_count] = np.hstack([lanes.numbers, lanes.bias, lanes.noise**2, lanes.drift**2])
+        constants[lane_count:], steps[:, lane_count:] = constants[:1], steps[:, :1]  # what fills the last call
+        now, found = np.zeros_like(steps[0]), np.zeros((count, 2 * m + size))
+        pair = np.zeros((count, packed)), np.zeros((count, packed))
+        run = [InPlace(step.map(calls), [a, constants, now], [b, found]) for a, b in (pair, pair[::-1])]
+        every = np.empty((n, lane_count, 2 * m + size))
+        restarts = {0, *readings.restarts}
+        for i in range(n):
+            if i in restarts:
+                pair[i % 2][:] = _starts(readings, i, y, size, count)
+            now[:] = steps[i]
+            run[i % 2]()
+            every[i] = found[:lane_count]
+        return cls(every[..., :m], every[..., m : 2 * m], every[..., 2 * m :])
 
 
 def _starts(readings: Readings, i: int, y: np.ndarray, size: int, count: int) -> np.ndarray:
@@ -228,7 +257,7 @@ def _angles(names: tuple[str, ...]) -> list[str]:
     return [name for name in _ANGLES if name in names]
 
 
-def rates_with_angles(robot: Any, names: tuple[str, ...]) -> Callable[[Any, Any], tuple[Any, ...]]:
+def _rates_with_angles(robot: Any, names: tuple[str, ...]) -> Callable[[Any, Any], tuple[Any, ...]]:
     """The equations of motion of a filter's state, (x, u) -> ẋ: those of the robot, and of wheels whose angles are read."""
     states, angles = len(robot.STATE), _angles(names)
 
@@ -239,7 +268,7 @@ def rates_with_angles(robot: Any, names: tuple[str, ...]) -> Callable[[Any, Any]
     return rates
 
 
-def expected_readings(robot: Any, names: tuple[str, ...], x: tuple[Any, ...], u: tuple[Any, ...]) -> list[Any]:
+def _expected_readings(robot: Any, names: tuple[str, ...], x: tuple[Any, ...], u: tuple[Any, ...]) -> list[Any]:
     """What perfect sensors without a bias read in a filter's state x under u."""
     places, sensed = _places(names, len(x)), {}
     if set(names) & set(_READINGS):
@@ -266,9 +295,9 @@ def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substep
     for name, number in zip(robot.SENSORS, numbers[len(kind.numbers) :], strict=True):
         object.__setattr__(model, name, number)
 
-    rates, x = rates_with_angles(model, names), held[:size]
+    rates, x = _rates_with_angles(model, names), held[:size]
     backwards = casadi.vertcat(*rates(_tuple(x), before))
-    earlier = {delay: expected_readings(model, names, _tuple(x - delay * backwards), before) for delay in set(delays)}
+    earlier = {delay: _expected_readings(model, names, _tuple(x - delay * backwards), before) for delay in set(delays)}
     expected = casadi.vertcat(*[earlier[delay][i] for i, delay in enumerate(delays)])
     z, p, missed, expected_variance = _corrected(
         x, _unpacked(held[size:], size), (expected, casadi.jacobian(expected, x)), (y, used, bias, variance)

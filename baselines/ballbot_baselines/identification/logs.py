@@ -10,14 +10,14 @@ quantity = "time"
 unit = "ms"
 
 [columns.roll]
-quantity = "lean_y"      # see `readable`
+quantity = "lean_y"      # see `Readings.readable`
 unit = "deg"
 sign = -1                # 1 by default
 scale = 1.0              # of raw values, 1 by default
 delay = 0.005            # s, by which the reading is older than its time
 
 [columns.pwm]
-quantity = "command_1"   # see `commanded`
+quantity = "command_1"   # see `Readings.commanded`
 unit = "pwm"             # with full: the value at full torque; "A" with torque_constant, N·m/A; "N m"; "N"
 full = 255
 ```
@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.identification.likelihood import COMMANDS, QUANTITIES, Readings, commanded, readable
+from ballbot_baselines.identification.likelihood import Readings
 from ballbot_gym import files
 from ballbot_gym.robot import Ballbot
 
@@ -67,7 +67,7 @@ class LogError(files.FileError):
 
 
 @dataclass(frozen=True)
-class Column:
+class _Column:
     """What a column of a log holds, as its TOML says."""
 
     name: str
@@ -78,18 +78,59 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Description:
+class _Description:
     """What the TOML of a log says."""
 
-    columns: tuple[Column, ...]
+    columns: tuple[_Column, ...]
     separator: str = ","
     names: tuple[str, ...] = ()
     rate: float | None = None
 
     @property
-    def by_quantity(self) -> dict[str, Column]:
+    def by_quantity(self) -> dict[str, _Column]:
         """The columns by what they hold."""
         return {column.quantity: column for column in self.columns}
+
+    @classmethod
+    def read(cls, path: Path, robot: Ballbot) -> "_Description":
+        """What the TOML of a log says.
+
+        Raises:
+            LogError: it is no TOML, or names a quantity or unit that there is not; the message says which there are.
+        """
+        try:
+            content = tomllib.loads(files.read(path).decode())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise LogError(f"{path} is not valid TOML: {error}") from None
+        if unknown := set(content) - {"columns", "separator", "names", "rate"}:
+            raise LogError(f"{path}: unknown entry {min(unknown)!r}; known: 'columns', 'separator', 'names', 'rate'")
+        given = content.get("columns")
+        if not isinstance(given, dict) or not all(isinstance(each, dict) for each in given.values()):
+            raise LogError(f"{path} has no table [columns.NAME] for each column")
+        columns = tuple(_column(f"{path}: column {name!r}", name, each, robot) for name, each in given.items())
+        names = [column.quantity for column in columns]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise LogError(f"{path}: two columns are {twice[0]!r}; leave one of them out")
+        for name in Readings.commanded(robot):
+            if name not in names:
+                raise LogError(
+                    f"{path}: no column has quantity = {name!r}; the commands of this robot must be in the log"
+                )
+        if not set(names) & set(Readings.readable(robot)):
+            raise LogError(
+                f"{path}: no column is a reading; give at least one of {', '.join(Readings.readable(robot))}"
+            )
+        rate = content.get("rate")
+        if ("time" in names) == (rate is not None):
+            raise LogError(f"{path}: give either a column with quantity = 'time', or rate, in Hz")
+        if rate is not None and not (isinstance(rate, int | float) and 1 <= rate <= 1e5):
+            raise LogError(f"{path}: rate must be a number of Hz, not {rate!r}")
+        separator, header = content.get("separator", ","), content.get("names", ())
+        if not (isinstance(separator, str) and len(separator) == 1):
+            raise LogError(f"{path}: separator must be one character, not {separator!r}")
+        if not all(isinstance(name, str) for name in header):
+            raise LogError(f"{path}: names must be a list of names, not {header!r}")
+        return cls(columns, separator, tuple(header), None if rate is None else float(rate))
 
 
 @dataclass(frozen=True)
@@ -97,57 +138,75 @@ class Log:
     """A log that was read, cleaned of what is wrong with it."""
 
     path: Path
-    description: Description
+    description: _Description
     readings: Readings
     findings: tuple[str, ...] = field(default=())
     """What is wrong with it, in sentences."""
 
+    @classmethod
+    def read(cls, path: Path, robot: Ballbot, columns: Path | None = None) -> "Log":
+        """A log of a robot, cleaned.
 
-def read_description(path: Path, robot: Ballbot) -> Description:
-    """What the TOML of a log says.
+        Args:
+            path: of the CSV, text or Parquet file.
+            robot: of the same kind.
+            columns: path of the TOML that says what the columns are; default, that of the same name.
 
-    Raises:
-        LogError: it is no TOML, or names a quantity or unit that there is not; the message says which there are.
-    """
-    try:
-        content = tomllib.loads(files.read(path).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LogError(f"{path} is not valid TOML: {error}") from None
-    if unknown := set(content) - {"columns", "separator", "names", "rate"}:
-        raise LogError(f"{path}: unknown entry {min(unknown)!r}; known: 'columns', 'separator', 'names', 'rate'")
-    given = content.get("columns")
-    if not isinstance(given, dict) or not all(isinstance(each, dict) for each in given.values()):
-        raise LogError(f"{path} has no table [columns.NAME] for each column")
-    columns = tuple(_column(f"{path}: column {name!r}", name, each, robot) for name, each in given.items())
-    names = [column.quantity for column in columns]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise LogError(f"{path}: two columns are {twice[0]!r}; leave one of them out")
-    for name in commanded(robot):
-        if name not in names:
-            raise LogError(f"{path}: no column has quantity = {name!r}; the commands of this robot must be in the log")
-    if not set(names) & set(readable(robot)):
-        raise LogError(f"{path}: no column is a reading; give at least one of {', '.join(readable(robot))}")
-    rate = content.get("rate")
-    if ("time" in names) == (rate is not None):
-        raise LogError(f"{path}: give either a column with quantity = 'time', or rate, in Hz")
-    if rate is not None and not (isinstance(rate, int | float) and 1 <= rate <= 1e5):
-        raise LogError(f"{path}: rate must be a number of Hz, not {rate!r}")
-    separator, header = content.get("separator", ","), content.get("names", ())
-    if not (isinstance(separator, str) and len(separator) == 1):
-        raise LogError(f"{path}: separator must be one character, not {separator!r}")
-    if not all(isinstance(name, str) for name in header):
-        raise LogError(f"{path}: names must be a list of names, not {header!r}")
-    return Description(columns, separator, tuple(header), None if rate is None else float(rate))
+        Raises:
+            LogError: it cannot be used; the message says why.
+        """
+        description = _Description.read(columns or path.with_suffix(".toml"), robot)
+        table, findings = _table(path, description), list[str]()
+        for column in description.columns:
+            if column.name not in table:
+                raise LogError(f"{path} has no column {column.name!r}; it has {', '.join(map(repr, table))}")
+        values = {c.quantity: _numbers(path, c.name, table[c.name], findings) * c.factor for c in description.columns}
+        count = len(next(iter(values.values())))
+        t = values.pop("time") if description.rate is None else np.arange(count) / description.rate
+        kept = _rows_in_time(path, t, findings)
+        t, growing, restarts = _clock(t[kept], findings)
+        t, values = t[growing], {name: column[kept][growing] for name, column in values.items()}
+        if len(t) < 2 or t[-1] - t[0] < _LEAST_SECONDS:
+            raise LogError(
+                f"{path} holds {0.0 if len(t) < 2 else t[-1] - t[0]:.3g} s; give a log of at least {_LEAST_SECONDS:g} s"
+            )
+        names = tuple(name for name in Readings.readable(robot) if name in values)
+        of = description.by_quantity
+        for name, column in values.items():
+            _check_column(path, of[name].name, column)
+            _remove_glitches(of[name].name, t, column, findings)
+        y = np.column_stack([values[name] for name in names])
+        commands = np.column_stack([values[name] for name in Readings.commanded(robot)])
+        delays = tuple(of[name].delay for name in names)
+        guessed = np.where(np.isfinite(commands), 0.0, np.nanstd(commands, axis=0))
+        commands = np.column_stack([_filled(column) for column in commands.T])
+        readings = Readings(names, t, y, commands, delays, restarts, guessed if guessed.any() else None)
+        return cls(path, description, readings, tuple(findings))
+
+    @staticmethod
+    def write(readings: Readings, path: Path) -> Path:
+        """Writes readings as CSV in SI units, with a line of names, and the TOML of its columns; returns the path."""
+        units, delays = readings.units, dict(zip(readings.names, readings.delays, strict=False))
+        table = np.column_stack([readings.t, readings.y, readings.commands])
+        rows = [",".join(f"{value:.9g}" for value in row) for row in table.tolist()]
+        lines = []
+        for name, unit in ({"time": "s"} | units).items():
+            lines += [f"[columns.{name}]", f'quantity = "{name}"', f'unit = "{unit}"']
+            lines += [f"delay = {delays[name]!r}", ""] if delays.get(name) else [""]
+        files.write(path.with_suffix(".toml"), "\n".join(lines))
+        return files.write(path, "\n".join([",".join(["time", *units]), *rows]) + "\n")
 
 
-def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> Column:
+def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> _Column:
     """A column as the TOML describes it."""
     if unknown := set(given) - _FIELDS:
         raise LogError(f"{place}: unknown entry {min(unknown)!r}; known: {', '.join(sorted(_FIELDS))}")
     quantity, unit = given.get("quantity"), given.get("unit")
-    own = readable(robot) | {"time": "s"}
-    if quantity not in (*own, *commanded(robot)):
-        raise LogError(f"{place}: unknown quantity {quantity!r}; known: {', '.join((*own, *commanded(robot)))}")
+    own = Readings.readable(robot) | {"time": "s"}
+    if quantity not in (*own, *Readings.commanded(robot)):
+        raise LogError(
+            f"{place}: unknown quantity {quantity!r}; known: {', '.join((*own, *Readings.commanded(robot)))}"
+        )
     numbers = {key: given.get(key, 1.0) for key in ("sign", "scale", "full", "torque_constant")} | {
         "delay": given.get("delay", 0.0)
     }
@@ -161,14 +220,14 @@ def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> Col
         or numbers["torque_constant"] <= 0
     ):
         raise LogError(f"{place}: sign must be 1 or -1, and scale, full and torque_constant must be positive")
-    if quantity in commanded(robot):
+    if quantity in Readings.commanded(robot):
         factor = _command_factor(place, unit, given, robot)
     else:
         known = _UNITS[own[quantity]]
         if unit not in known:
             raise LogError(f"{place}: unit of {quantity} must be one of {', '.join(map(repr, known))}, not {unit!r}")
         factor = known[unit]
-    return Column(name, quantity, factor * numbers["sign"] * numbers["scale"], float(numbers["delay"]))
+    return _Column(name, quantity, factor * numbers["sign"] * numbers["scale"], float(numbers["delay"]))
 
 
 def _command_factor(place: str, unit: Any, given: dict[str, Any], robot: Ballbot) -> float:
@@ -190,64 +249,7 @@ def _command_factor(place: str, unit: Any, given: dict[str, Any], robot: Ballbot
     return by_unit[unit]
 
 
-def description_text(readings: Readings) -> str:
-    """The TOML of a log that `log_text` writes."""
-    lines = []
-    delays = dict(zip(readings.names, readings.delays, strict=False))
-    for name, unit in ({"time": "s"} | _si_units(readings)).items():
-        lines += [f"[columns.{name}]", f'quantity = "{name}"', f'unit = "{unit}"']
-        lines += [f"delay = {delays[name]!r}", ""] if delays.get(name) else [""]
-    return "\n".join(lines)
-
-
-def log_text(readings: Readings) -> str:
-    """A log as CSV, in SI units, with a line of names."""
-    table = np.column_stack([readings.t, readings.y, readings.commands])
-    lines = [",".join(["time", *_si_units(readings)])]
-    lines += [",".join(f"{value:.9g}" for value in row) for row in table.tolist()]
-    return "\n".join(lines) + "\n"
-
-
-def _si_units(readings: Readings) -> dict[str, str]:
-    commands = COMMANDS[readings.commands.shape[1]]
-    return {name: QUANTITIES[name] for name in readings.names} | dict.fromkeys(commands, "N")
-
-
-def read_log(path: Path, description: Description, robot: Ballbot) -> Log:
-    """A log, cleaned.
-
-    Raises:
-        LogError: it cannot be used; the message says why.
-    """
-    table, findings = _table(path, description), list[str]()
-    for column in description.columns:
-        if column.name not in table:
-            raise LogError(f"{path} has no column {column.name!r}; it has {', '.join(map(repr, table))}")
-    values = {c.quantity: _numbers(path, c.name, table[c.name], findings) * c.factor for c in description.columns}
-    count = len(next(iter(values.values())))
-    t = values.pop("time") if description.rate is None else np.arange(count) / description.rate
-    kept = _rows_in_time(path, t, findings)
-    t, growing, restarts = _clock(t[kept], findings)
-    t, values = t[growing], {name: column[kept][growing] for name, column in values.items()}
-    if len(t) < 2 or t[-1] - t[0] < _LEAST_SECONDS:
-        raise LogError(
-            f"{path} holds {0.0 if len(t) < 2 else t[-1] - t[0]:.3g} s; give a log of at least {_LEAST_SECONDS:g} s"
-        )
-    names = tuple(name for name in readable(robot) if name in values)
-    of = description.by_quantity
-    for name, column in values.items():
-        _check_column(path, of[name].name, column)
-        _remove_glitches(of[name].name, t, column, findings)
-    y = np.column_stack([values[name] for name in names])
-    commands = np.column_stack([values[name] for name in commanded(robot)])
-    delays = tuple(of[name].delay for name in names)
-    guessed = np.where(np.isfinite(commands), 0.0, np.nanstd(commands, axis=0))
-    commands = np.column_stack([_filled(column) for column in commands.T])
-    readings = Readings(names, t, y, commands, delays, restarts, guessed if guessed.any() else None)
-    return Log(path, description, readings, tuple(findings))
-
-
-def _table(path: Path, description: Description) -> dict[str, Any]:
+def _table(path: Path, description: _Description) -> dict[str, Any]:
     """The columns of a file by name, as text or numbers."""
     if path.suffix == ".parquet":
         return _parquet(path)

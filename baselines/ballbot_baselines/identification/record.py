@@ -8,7 +8,7 @@ import numpy as np
 
 from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.feedback.lqr import LqrController
-from ballbot_baselines.identification.likelihood import Readings, readable
+from ballbot_baselines.identification.likelihood import Readings
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import Ballbot, Randomization, Sensors
 from ballbot_gym.rollout import Controller, rollout
@@ -39,11 +39,6 @@ class Recorded(NamedTuple):
     """The greatest, rad."""
 
 
-def still(t: float) -> np.ndarray:
-    """The motion of a robot that balances in one place."""
-    return np.zeros(3)
-
-
 class Waves(NamedTuple):
     """A motion of sines."""
 
@@ -58,22 +53,20 @@ class Waves(NamedTuple):
         waves = self.amplitudes * np.sin(2 * math.pi * self.frequencies * t + self.phases)
         return min(t / _BEGIN, 1.0) * waves.sum(axis=1)
 
+    @classmethod
+    def still(cls) -> "Waves":
+        """The motion of a robot that balances in one place."""
+        return cls(np.zeros((3, 1)), np.zeros(1), np.zeros((3, 1)))
 
-def driving(robot: Ballbot, rng: np.random.Generator) -> Waves:
-    """A motion of five waves of random phase, with leans of up to about ten degrees and half the force of the drive."""
-    frequencies = np.array([0.07, 0.16, 0.31, 0.53, 0.87])
-    most = min(1.0, 0.25 * robot.FORCE_SHARE * robot.force_limit / robot.total_mass)  # m/s², of all waves together
-    acceleration = most / math.sqrt(len(frequencies)) * np.array([0.3, 0.8, 1.0, 1.0, 1.0])
-    along = acceleration / (2 * math.pi * frequencies) ** 2
-    amplitudes = np.minimum([along, along, np.full(len(along), _TURN)], 2.0)
-    return Waves(amplitudes, frequencies, rng.uniform(0, 2 * math.pi, amplitudes.shape))
-
-
-def recorded_names(robot: Ballbot) -> tuple[str, ...]:
-    """What `record` reads of a robot, see `readable`."""
-    if not robot.SENSORS:
-        return _STATES
-    return tuple(name for name in readable(robot) if name.startswith(("gyro", "accel", "wheel_angle")))
+    @classmethod
+    def driving(cls, robot: Ballbot, rng: np.random.Generator) -> "Waves":
+        """A motion of five waves of random phase, with leans of up to about ten degrees and half the force of the drive."""
+        frequencies = np.array([0.07, 0.16, 0.31, 0.53, 0.87])
+        most = min(1.0, 0.25 * robot.FORCE_SHARE * robot.force_limit / robot.total_mass)  # m/s², of all waves together
+        acceleration = most / math.sqrt(len(frequencies)) * np.array([0.3, 0.8, 1.0, 1.0, 1.0])
+        along = acceleration / (2 * math.pi * frequencies) ** 2
+        amplitudes = np.minimum([along, along, np.full(len(along), _TURN)], 2.0)
+        return cls(amplitudes, frequencies, rng.uniform(0, 2 * math.pi, amplitudes.shape))
 
 
 class _Driver:
@@ -129,7 +122,7 @@ def record(
     Args:
         robot: the nominal one.
         seconds: of the log.
-        motion: where it is asked to be; default, `driving`.
+        motion: where it is asked to be; default, `Waves.driving`.
         randomization: what differs from the nominal robot, or a name in `TRACKS`.
         physics: same as in `BallbotEnv`.
         seed: of what is drawn.
@@ -137,7 +130,7 @@ def record(
     Raises:
         ValueError: the robot fell.
     """
-    motion = driving(robot, np.random.default_rng(seed)) if motion is None else motion
+    motion = Waves.driving(robot, np.random.default_rng(seed)) if motion is None else motion
     senses, fields = bool(robot.SENSORS), {"duration": seconds, "control_dt": 1 / RATE, "arena_radius": 100.0}
     task = make_task("stabilize", robot, **fields)
     env = BallbotEnv(
@@ -164,8 +157,9 @@ def record(
 def _readings(robot: Ballbot, task: Task, logger: _Logger) -> Readings:
     seen, commands = np.array(logger.seen), np.array(logger.commands)
     t = np.arange(len(seen)) * task.control_dt
-    names, delays = recorded_names(robot), ()
+    names, delays = _STATES, ()
     if robot.SENSORS:
+        names = tuple(name for name in Readings.readable(robot) if name.startswith(("gyro", "accel", "wheel_angle")))
         seen = seen[:, :9] * Sensors.SCALE
         seen[:, 6:] = np.cumsum(seen[:, 6:], axis=0)
         delays = (task.control_dt / 2,) * 6 + (0.0,) * 3  # gyroscope and accelerometer show means over a step

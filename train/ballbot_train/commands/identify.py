@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from ballbot_baselines.identification.design import design as designed
 from ballbot_baselines.identification.identify import Identified
 from ballbot_baselines.identification.identify import identify as identified
-from ballbot_baselines.identification.likelihood import Readings, innovations
-from ballbot_baselines.identification.logs import LogError, description_text, log_text, read_description, read_log
+from ballbot_baselines.identification.likelihood import Innovations, Readings
+from ballbot_baselines.identification.logs import Log, LogError
 from ballbot_baselines.identification.record import Waves
 from ballbot_baselines.identification.record import record as recorded
 from ballbot_gym import files
@@ -83,8 +83,7 @@ def identify(
             _design(nominal, length, math.radians(max_lean), known, out)
         return
     _refuse(not logs, "give the path of a log; `ballbot identify --record` makes one of a simulated robot")
-    description = read_description(columns or logs[0].with_suffix(".toml"), nominal)
-    read = [read_log(path, description, nominal) for path in logs]
+    read = [Log.read(path, nominal, columns or logs[0].with_suffix(".toml")) for path in logs]
     with progress_bar() as progress:
         bar = progress.add_task("likelihood", total=None)
         result = identified(nominal, read, known, lambda done: progress.update(bar, completed=done))
@@ -112,8 +111,7 @@ def _record(
     track = track or ("unknown" if nominal.SENSORS else "real")
     waves = None if motion is None else _motion(motion)
     log = recorded(nominal, seconds, waves, track, physics_or_default(physics, name), seed)
-    path = files.write(out / "log.csv", log_text(log.readings))
-    files.write(out / "log.toml", description_text(log.readings))
+    path = Log.write(log.readings, out / "log.csv")
     true = files.write(out / "true.urdf", urdf_text(log.robot))
     console.print(f"log: {path}, {seconds:g} s\ncolumns: {out / 'log.toml'}")
     console.print(f"the robot that made it, with a delay of {1e3 * log.delay:g} ms: {true}")
@@ -235,7 +233,7 @@ def _write(result: Identified, readings: Readings, robot: str, logs: list[str], 
 def _residual_figure(result: Identified, readings: Readings) -> Figure:
     """Innovations over their expected deviations: white noise of size 1 where the robot explains the log."""
     problem = result.found.problem
-    inside = innovations(problem.robot, readings, problem.lanes(result.found.z[None]))
+    inside = Innovations.of(problem.robot, readings, problem.lanes(result.found.z[None]))
     scaled = np.where(np.isfinite(readings.y), inside.missed[:, 0] / np.sqrt(inside.variance[:, 0]), np.nan)
     rows = math.ceil(len(readings.names) / 2)
     figure = Figure(figsize=(12, 1.5 * rows + 1), layout="constrained")
