@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ballbot_baselines.identification.design import design as designed
 from ballbot_baselines.identification.identify import Identified
@@ -31,6 +30,7 @@ from ballbot_train.work.console import (
 
 with imports_of(__name__):
     import tyro
+    from matplotlib.figure import Figure
 
 _LONGEST = 600.0  # s of a recorded log
 _DOTS = 2000  # of a residual figure's axis
