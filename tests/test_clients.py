@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "clients.md").read_text()
 _TITLES = re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
 _CODE = {title: "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)) for title, text in _TITLES}
-SECTIONS = {title: code.replace("6_144_000", "4096") for title, code in _CODE.items() if code}
+SECTIONS = {title: code.replace("15_360_000", "4096") for title, code in _CODE.items() if code}
 """The code of each section by its title; a training of minutes is shortened."""
 OURS = {"ballbot_gym", "ballbot_train"}
 NEEDS = {"RL Baselines3 Zoo": {"rl_zoo3"}}  # besides what the code imports
