@@ -70,7 +70,8 @@ def test_on_a_package_index_every_link_and_picture_of_readme_is_absolute_and_of_
     raw = repository.replace("//github.com", "//raw.githubusercontent.com")
     links = re.findall(r"(!?)\[[^\[\]]*\]\(([^)]*)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
     assert {link for picture, link in links if picture} == {
-        f"{raw}/main/docs/pictures/{name}" for name in ("logo.svg", "lean.webp", "playground.webp")
+        f"{raw}/main/docs/pictures/{name}"
+        for name in ("logo.svg", "lean.webp", "playground.webp", "learning-curves.png")
     }
     for picture, link in links:
         if link.startswith("#"):  # a place in the page itself
