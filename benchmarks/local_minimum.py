@@ -42,14 +42,8 @@ _ROUNDING = 32 * float(np.finfo(np.float64).eps)  # of a product of matrices, re
 
 
 _LEAST = (1e-13, 1e-11, 1e-13, 1e-13)  # of the box, m, N and so on: so that no side of it is 0
-_CURVED = (
-    2,
-    3,
-    6,
-    7,
-    8,
-    9,
-)  # leans, lean rates and forces: a step is linear in positions and speeds, which jets verify
+# leans, lean rates and forces: a step is linear in positions and speeds, which jets verify
+_CURVED = (2, 3, 6, 7, 8, 9)
 
 
 class NotProvenError(ArithmeticError):
@@ -178,9 +172,14 @@ def _turned(a: np.ndarray) -> np.ndarray:
     return np.swapaxes(a, -1, -2)
 
 
+def _slopes(point: Point, parts: Parts) -> Ball:
+    """Slopes (n, 10) of the Hamiltonian with respect to states and forces."""
+    return parts.cost[1][:, 0] + (point.lam[1:, None] @ parts.step[1])[:, 0]
+
+
 def gradients(point: Point, parts: Parts) -> tuple[Ball, Ball]:
     """Slopes of the Lagrangian with respect to x_k (n+1, 8), without the weight of squares, and to u_k (n, 2)."""
-    slope = parts.cost[1][:, 0] + (point.lam[1:, None] @ parts.step[1])[:, 0]
+    slope = _slopes(point, parts)
     along_x = join(np.concatenate, [slope[:, :8], 0.0 * parts.limits[1][-1:, 0, :8]]) - point.lam
     rows = [along_x[k] for k in range(len(point.x))]
     for (k, i), mu in zip(point.rows, point.mu, strict=True):
@@ -415,9 +414,7 @@ def _check_constraints(problem: Problem, inside: Point, parts: Parts) -> None:
         raise NotProvenError(f"strict complementarity: a multiplier may be {multipliers.min():.3g}")
     if not (forces[~fixed] < limit).all():
         raise NotProvenError("a free force may exceed its bound")
-    sign = np.sign(inside.u.m)
-    slope = parts.cost[1][:, 0] + (inside.lam[1:, None] @ parts.step[1])[:, 0]
-    inwards = (-slope[:, 8:] * sign).least[fixed]
+    inwards = (-_slopes(inside, parts)[:, 8:] * np.sign(inside.u.m)).least[fixed]
     if not (inwards > 0).all():
         raise NotProvenError(f"strict complementarity: the multiplier of a force may be {inwards.min():.3g}")
     n, values, limits = len(fixed), parts.limits[0], parts.ends

@@ -6,10 +6,8 @@ import numpy as np
 from intervals import Ball
 from local_minimum import Linear, NotProvenError, Parts, Point, Problem, parts_of, residual
 
-_ACTIVE_FORCE, _ACTIVE = (
-    1e-6,
-    1e-5,
-)  # shares of a force's limit and values of constraints from which these count as active
+# a force this share of its limit from it counts as active, and a constraint whose value is below this
+_ACTIVE_FORCE, _ACTIVE = 1e-6, 1e-5
 _CLOSE = 1e-3  # share of the force limit: of steps after which the active set is corrected
 _CONVERGED = 1e-10  # the same, of steps after which Newton's method has converged
 _MOST_STEPS = 12

@@ -118,7 +118,7 @@ def main(folders: list[str]) -> None:
         add([Path(folder) for folder in folders])
     picture().savefig(PICTURE, dpi=110)
     print(table(), end="")
-    print(PICTURE.relative_to(Path.cwd()) if PICTURE.is_relative_to(Path.cwd()) else PICTURE)
+    print(PICTURE)
 
 
 if __name__ == "__main__":

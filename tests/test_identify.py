@@ -370,6 +370,7 @@ def test_the_command_writes_a_robot_that_other_commands_take(readings: Readings,
         ({"record": True, "motion": Path("none.json")}, "none.json: no such file"),
         ({"logs": (Path("none.csv"),)}, "none.toml: no such file"),
         ({"record": True, "seconds": 1.0}, "seconds must be from 5 to 600, not 1"),
+        ({"record": True, "seconds": 0.0}, "seconds must be from 5 to 600, not 0"),
         ({"record": True, "seed": -1}, "seed must be at least 0"),
     ],
 )

@@ -13,12 +13,12 @@ import numpy as np
 from ballbot_gym import ops, seeding
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.robot import Randomization, Robot
-from ballbot_gym.step import PAY, StepState, step
+from ballbot_gym.step import FLAGS, PAY, StepState, step
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.autoreset import Info, Step, _as_gymnasium, _info_of
 from ballbot_gym.vector.state import BatchState
 
-FLAG_ROWS = 6
+FLAG_ROWS = len(FLAGS) + 1
 """Rows of flags: those of `step.FLAGS`, and whether the episode is done."""
 
 State = Any

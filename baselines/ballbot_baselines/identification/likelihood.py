@@ -291,10 +291,7 @@ def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substep
     step = symbol("step", 2 * m + 3 * actions + 1)
     numbers, bias, variance, drift = _split(constants, count, m, m, 2)
     y, used, before, u, uncertain, dt = _split(step, m, m, actions, actions, actions, 1)
-    model: Any = kind.model(numbers[: len(kind.numbers)])
-    for name, number in zip(robot.SENSORS, numbers[len(kind.numbers) :], strict=True):
-        object.__setattr__(model, name, number)
-
+    model = Kind(robot, (*kind.numbers, *robot.SENSORS)).model(numbers)
     rates, x = _rates_with_angles(model, names), held[:size]
     backwards = casadi.vertcat(*rates(_tuple(x), before))
     earlier = {delay: _expected_readings(model, names, _tuple(x - delay * backwards), before) for delay in set(delays)}

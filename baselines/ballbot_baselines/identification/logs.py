@@ -280,9 +280,9 @@ def _parquet(path: Path) -> dict[str, Any]:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise LogError(f"{path}: reading Parquet needs pyarrow: pip install pyarrow; or give a CSV file") from None
-    files.read(path)
+    content = io.BytesIO(files.read(path))
     try:
-        table = parquet.read_table(path)
+        table = parquet.read_table(content)
     except (OSError, ValueError) as error:
         raise LogError(f"{path} is not a valid Parquet file: {error}") from None
     return {name: table.column(name).to_numpy() for name in table.column_names}

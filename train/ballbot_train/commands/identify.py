@@ -74,7 +74,7 @@ def identify(
         raise ValueError(f"identify is for ballbots, and {robot!r} is a {type(nominal).__name__}")
     if record or design:
         _refuse(bool(logs) or (record and design), "give one of: paths of logs, --record, --design")
-        length = seconds or (60.0 if record else 20.0)
+        length = (60.0 if record else 20.0) if seconds is None else seconds
         _refuse(not 5 <= length <= _LONGEST, f"seconds must be from 5 to {_LONGEST:g}, not {length:g}")
         _refuse(not 1 <= max_lean <= 30, f"max_lean must be from 1 to 30 degrees, not {max_lean:g}")
         if record:
