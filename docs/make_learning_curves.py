@@ -1,11 +1,13 @@
-"""Draws regret over training time, and prints the minutes to 5, 2 and 1 %: python docs/make_learning_curves.py [RUN ...]
+"""Draws regret over training time, and writes the tables of from-scratch.md: python docs/make_learning_curves.py [RUN ...]
 
 RUN is a folder of `ballbot train`. Its evaluations first go into experiments/learning-curves.csv and replace those of another
-run with the same task, learner and seed. The picture and the table show what that file holds.
+run with the same task, learner and seed. The picture and the table of minutes show what that file holds. The table of runs
+shows from-scratch.csv, which is written by hand.
 """
 
 import csv
 import json
+import re
 import sys
 from collections import defaultdict
 from io import StringIO
@@ -16,12 +18,18 @@ from matplotlib.figure import Figure
 
 from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
+from ballbot_train.evaluation.statistics import Interval
 from ballbot_train.report.labels import color, label
 from ballbot_train.work.console import markdown
 
-CURVES = Path(__file__).parent / "experiments" / "learning-curves.csv"
+_EXPERIMENTS = Path(__file__).parent / "experiments"
+PAGE = _EXPERIMENTS / "from-scratch.md"
+RUNS = _EXPERIMENTS / "from-scratch.csv"
+CURVES = _EXPERIMENTS / "learning-curves.csv"
 PICTURE = Path(__file__).parent / "pictures" / "learning-curves.png"
 LEVELS = (0.05, 0.02, 0.01)
+_EPISODES = 10_000  # in which failures are counted
+_TABLES = re.compile(r"(<!-- (\w+) -->\n).*?(<!-- end of \2 -->)", flags=re.DOTALL)
 _RUN = ("task", "learner", "seed")
 _COLUMNS = (*_RUN, "cpu_seconds", "regret_mean", "success")
 _RELIABLE = 0.99  # the mean regret of those that succeed says little where fewer do
@@ -29,9 +37,9 @@ _RELIABLE = 0.99  # the mean regret of those that succeed says little where fewe
 Row = dict[str, str]
 
 
-def read() -> list[Row]:
-    """Rows of the file, one for each evaluation."""
-    return list(csv.DictReader(CURVES.read_text(encoding="utf-8").splitlines())) if CURVES.exists() else []
+def read(path: Path = CURVES) -> list[Row]:
+    """Rows of a file; of the default, one for each evaluation."""
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
 def add(folders: list[Path]) -> None:
@@ -41,7 +49,7 @@ def add(folders: list[Path]) -> None:
         config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         run = {name: str(config[name]) for name in _RUN}
         rows = [row for row in rows if any(row[name] != run[name] for name in _RUN)]
-        found = csv.DictReader((folder / "evaluations.csv").read_text(encoding="utf-8").splitlines())
+        found = read(folder / "evaluations.csv")
         rows += [run | {"cpu_seconds": f"{float(row['cpu_seconds']):.0f}", **_shown(row)} for row in found]
     rows.sort(key=lambda row: (list(TASKS).index(row["task"]), row["learner"], int(row["seed"])))
     text = StringIO()
@@ -68,13 +76,38 @@ def curves() -> dict[tuple[str, str], list[np.ndarray]]:
     return found
 
 
-def table() -> str:
+def page() -> str:
+    """The page as both files make it."""
+    tables = {"runs": run_table(), "minutes": minute_table()}
+    text = PAGE.read_text(encoding="utf-8")
+    return _TABLES.sub(lambda match: f"{match[1]}\n{tables[match[2]]}\n{match[3]}", text)
+
+
+def run_table() -> str:
+    """The policy that each run chose: its training time, its success and regret, and how often it fails."""
+    rows = []
+    for row in read(RUNS):
+        failures = int(row["failures_per_10000"])
+        ends = Interval.of_share(failures, _EPISODES)
+        low, high = (f"{_EPISODES * end:.2g}" for end in (ends.low, ends.high))
+        shares = (float(row[name]) for name in ("regret_mean", "regret_median"))
+        rows.append(
+            [row["task"].capitalize(), row["learner"], row["seed"], f"{float(row['cpu_seconds']) / 60:.1f}"]
+            + [f"{100 * float(row['success']):.0f} %", *(f"{100 * share:.1f} %" for share in shares)]
+            + [f"{failures} ({low} to {high})"]
+        )
+    return markdown(
+        ["task", "learner", "seed", "minutes", "success", "mean regret", "median", "failures per 10,000, 95 %"], rows
+    )
+
+
+def minute_table() -> str:
     """Minutes of one core until the mean regret falls below each level: the median of the runs, and their range."""
     rows = []
     for (task, learner), runs in curves().items():
         times = [[_first(run, level) for run in runs] for level in LEVELS]
         rows.append([task.capitalize(), learner, str(len(runs)), *map(_minutes, times)])
-    return markdown(["task", "learner", "seeds", *(f"minutes to {level:.0%}" for level in LEVELS)], rows)
+    return markdown(["task", "learner", "seeds", *(f"minutes to {100 * level:.0f} %" for level in LEVELS)], rows)
 
 
 def _first(run: np.ndarray, level: float) -> float:
@@ -113,12 +146,12 @@ def picture() -> Figure:
 
 
 def main(folders: list[str]) -> None:
-    """Adds these runs, draws the picture and prints the table."""
+    """Adds these runs, draws the picture and writes the page."""
     if folders:
         add([Path(folder) for folder in folders])
     picture().savefig(PICTURE, dpi=110)
-    print(table(), end="")
-    print(PICTURE)
+    files.write(PAGE, page())
+    print(PICTURE, PAGE, sep="\n")
 
 
 if __name__ == "__main__":

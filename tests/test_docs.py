@@ -202,6 +202,14 @@ def test_the_leaderboard_s_page_is_made_from_its_rows():
     assert make_leaderboard.page() == make_leaderboard.PAGE.read_text()
 
 
+def test_the_page_of_training_from_scratch_shows_the_runs(monkeypatch):
+    """Where this fails, `python docs/make_learning_curves.py` writes it anew."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    import make_learning_curves
+
+    assert make_learning_curves.page() == make_learning_curves.PAGE.read_text()
+
+
 def test_the_films_are_of_the_submissions_that_the_leaderboard_has_and_small():
     """Where this fails, `make gallery` makes them anew."""
     sys.path.insert(0, str(ROOT / "docs"))
