@@ -107,7 +107,7 @@ def _feedforward(model: LinearQuadratic, gains: Gains) -> np.ndarray:
     same model. The model includes the errors of the reference in the equations of motion, and the gradients of the cost.
     """
     x, u, dt = model.x, model.u, model.task.control_dt
-    (a, b), (_, r), (of_x, of_u) = model.dynamics, model.costs, model.cost_slopes
+    (a, b), (_, r), (of_x, of_u) = model.dynamics, model.step_costs, model.step_cost_slopes
     missed = np.zeros_like(x)
     missed[:-1] = model.params.step(x, u, dt, model.params.substeps(dt))[:-1] - x[1:]
     forces = np.zeros_like(u)
@@ -115,7 +115,7 @@ def _feedforward(model: LinearQuadratic, gains: Gains) -> np.ndarray:
     for i in reversed(range(len(x))):
         after = gains.p[i + 1]
         slope = slope + after @ missed[i]
-        along = dt * of_u[i] / 2 + b[i].T @ slope
-        forces[i] = -np.linalg.solve(r[i] * dt + b[i].T @ after @ b[i], along)
-        slope = dt * of_x[i] / 2 + a[i].T @ slope - gains.k[i].T @ along
+        along = of_u[i] / 2 + b[i].T @ slope
+        forces[i] = -np.linalg.solve(r[i] + b[i].T @ after @ b[i], along)
+        slope = of_x[i] / 2 + a[i].T @ slope - gains.k[i].T @ along
     return forces

@@ -92,11 +92,11 @@ def _model(task: Task, params: Any) -> tuple[np.ndarray, np.ndarray]:
     responses divided by √s.
     """
     params = params.ideal()  # with wheels it moves nearly as without
-    dt, no_constants = task.control_dt, np.zeros(len(task.constant_names))
+    no_constants = np.zeros(len(task.constant_names))
     at_rest = LinearQuadratic(task, params, np.zeros((1, 8)), np.zeros((1, 2)), no_constants)
-    ((a,), (b,)), ((q,), (r,)) = at_rest.dynamics, at_rest.costs
+    ((a,), (b,)), ((q,), (r,)) = at_rest.dynamics, at_rest.step_costs
     a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]
-    q, r = q[np.ix_(_ACROSS, _ACROSS)] * dt, r[1:, 1:] * dt
+    q, r = q[np.ix_(_ACROSS, _ACROSS)], r[1:, 1:]
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     price = r + b.T @ p @ b
     closed = a - b @ np.linalg.solve(price, b.T @ p @ a)

@@ -63,10 +63,16 @@ class LinearQuadratic:
         return weights, 0.5 * _blocks(r, n)
 
     @cached_property
-    def cost_slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The gradient of the task's cost rate with respect to x (n, 8) and to u (n, 2)."""
+    def step_costs(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same of a control step: Q and R times `control_dt`."""
+        q, r = self.costs
+        return q * self.task.control_dt, r * self.task.control_dt
+
+    @cached_property
+    def step_cost_slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """The gradient of a control step's cost with respect to x (n, 8) and to u (n, 2)."""
         along_x, along_u = self._derivatives(1)
-        return np.array(along_x).T, np.array(along_u).T
+        return self.task.control_dt * np.array(along_x).T, self.task.control_dt * np.array(along_u).T
 
     @cached_property
     def goal_weights(self) -> np.ndarray:

@@ -29,8 +29,7 @@ class Gains:
     @classmethod
     def before(cls, p_final: np.ndarray, model: LinearQuadratic) -> "Gains":
         """Time-varying LQR over the control steps of a model, backwards from the final cost-to-go P (8, 8)."""
-        (a, b), (q, r), dt = model.dynamics, model.costs, model.task.control_dt
-        q, r = q * dt, r * dt
+        (a, b), (q, r) = model.dynamics, model.step_costs
         k, p = np.zeros((*b.shape[::2], b.shape[1])), np.zeros((len(a) + 1, *p_final.shape))
         after = p[-1] = p_final
         for i in reversed(range(len(a))):
@@ -50,9 +49,8 @@ def discrete_lqr(
     Raises:
         PlanError: the cost rate has no curvature there in the state or in the force, so that LQR has no gain.
     """
-    model, dt = LinearQuadratic(task, params, x[None], u[None], c, t), task.control_dt
-    ((a,), (b,)), ((q,), (r,)) = model.dynamics, model.costs
-    q, r = q * dt, r * dt
+    model = LinearQuadratic(task, params, x[None], u[None], c, t)
+    ((a,), (b,)), ((q,), (r,)) = model.dynamics, model.step_costs
     try:
         p = scipy.linalg.solve_discrete_are(a, b, q, r)
     except np.linalg.LinAlgError:

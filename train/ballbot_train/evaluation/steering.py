@@ -29,12 +29,11 @@ def costates(task: Task, robot: Robot, x: np.ndarray, action: np.ndarray, c: np.
     After a deviation time-varying LQR steers back to the motion. Along an optimum the slopes do not depend on the
     feedback. Without feedback they would grow as fast as the robot falls.
     """
-    n, dt = len(action), task.control_dt
+    n = len(action)
     force, before = robot.force_limit * action, x[:-1]
     model = LinearQuadratic(task, robot, before, force, c)
-    a, b = model.dynamics
-    along_x, along_u = (dt * slopes for slopes in model.cost_slopes)
-    _, final = lqr_at_end(task, robot, x[-1], c, n * dt)
+    (a, b), (along_x, along_u) = model.dynamics, model.step_cost_slopes
+    _, final = lqr_at_end(task, robot, x[-1], c, n * task.control_dt)
     k = Gains.before(final, model).k
     costate = np.zeros_like(before)
     costate[-1] = _at_end(task, x, force[-1], c)
