@@ -127,7 +127,7 @@ def between_states(
     )
 
 
-def _circular_orbit(name: str, speed: float, radius: float, intervals: int = INTERVALS) -> Problem:
+def _circular_orbit(name: str, speed: float, radius: float) -> Problem:
     """The paper's optimization 2: a closed circle at constant ground speed, m/s, from (0, y ≥ 0). Its radius q[0] is free;
     the guess of it is `radius`, m.
     """
@@ -135,7 +135,7 @@ def _circular_orbit(name: str, speed: float, radius: float, intervals: int = INT
     def cost(x: ops.Vector, u: ops.Vector, h: float, q: ops.Vector) -> float:
         px, py, *_ = ops.components(x)
         effort = EFFORT_WEIGHT * squared(*ops.components(u))
-        return ORBIT_WEIGHT * squared(px, py) + effort + TIME_WEIGHT * h * intervals
+        return ORBIT_WEIGHT * squared(px, py) + effort + TIME_WEIGHT * h * INTERVALS
 
     def on_circle(x: ops.Vector, u: ops.Vector, q: ops.Vector) -> tuple:
         px, py, _, _, vx, vy, _, _ = ops.components(x)
@@ -149,7 +149,7 @@ def _circular_orbit(name: str, speed: float, radius: float, intervals: int = INT
         cost=cost,
         initial=(lower, upper),
         final=(-everywhere, everywhere),
-        intervals=intervals,
+        intervals=INTERVALS,
         lean_limit=LEAN_LIMIT,
         periodic=True,
         free=((0.1, 10.0, radius),),
@@ -157,11 +157,9 @@ def _circular_orbit(name: str, speed: float, radius: float, intervals: int = INT
     )
 
 
-def _hermite_guess(
-    params: Ballbot, x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int = INTERVALS
-) -> Trajectory:
+def _hermite_guess(params: Ballbot, x0: np.ndarray, x1: np.ndarray, duration: float) -> Trajectory:
     """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces; duration in s."""
-    path = cubic(x0[:2], x0[4:6], x1[:2], x1[4:6], intervals, duration / intervals)
+    path = cubic(x0[:2], x0[4:6], x1[:2], x1[4:6], INTERVALS, duration / INTERVALS)
     return _along(params, path, x0, x1, duration)
 
 

@@ -129,10 +129,10 @@ def near_share(goal_errors: Sequence[float] | np.ndarray, failure: Sequence[bool
     return math.nan if unknown.any() else float(near.mean())
 
 
-def success_text(success: float, near: float, digits: int = 1) -> str:
+def success_text(success: float, near: float) -> str:
     """A success rate in per cent; where more episodes ended near the goal, followed by their share."""
-    text = f"{100 * success:.{digits}f} %"
-    return f"{text} ({100 * near:.{digits}f} % near)" if near > success else text
+    text = f"{100 * success:.1f} %"
+    return f"{text} ({100 * near:.1f} % near)" if near > success else text
 
 
 def _row(results: Sequence[Result], seed: int) -> Row:
