@@ -131,7 +131,7 @@ class ModelFree(ABC):
         self.iteration, self._settings, self._task, self._warm = 0, config, task, warm
         self._demos = None if demos is None else Samples.of(demos.observations, demos.actions)
         self._trained = task if control_dt is None else replace(task, control_dt=control_dt)
-        self._backwards, self._pay = backwards, not (backwards or (warm and task.first_exit))
+        self._pay = not (backwards or (warm and task.first_exit))
         self._reward_scale = _REWARD_SCALE if self._pay else _COST_SCALE
         self._gamma = self._per_step(config.gamma)
         self._settled: float | None = None  # share of the iterations after which the curriculum was over
@@ -283,11 +283,9 @@ class ModelFree(ABC):
 
     @property
     def _progress(self) -> float:
-        """Share of their course that the schedules are through. Backwards, they wait until the curriculum is over, because
-        learning needs the initial noise until then.
+        """Share of their course that the schedules are through. They wait until a curriculum is over, because learning needs
+        the initial noise until then.
         """
-        if not self._backwards:
-            return self._share_done
         if self._settled is None:
             return min(self._share_done, _WAITING_PROGRESS)
         begun = min(self._settled, _WAITING_PROGRESS)
@@ -302,7 +300,7 @@ class ModelFree(ABC):
     def _learning_rate(self) -> float:
         """The learning rate now. Large steps find the way backwards, and small ones then bring costs down."""
         rate, fraction = self._settings.learning_rate, self._settings.final_learning_rate_fraction
-        if self._settled is not None and self._backwards:
+        if self._settled is not None and self.difficulty:
             settled = _SETTLED_LEARNING_RATE
             return _linear(settled, fraction * rate / settled, self._since_settled)
         return _linear(rate, fraction, self._progress)
