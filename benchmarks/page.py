@@ -28,7 +28,7 @@ import numpy as np
 import tyro
 
 from ballbot_gym import files
-from ballbot_train.work.provenance import commit_of, provenance
+from ballbot_train.work.provenance import provenance
 
 _HERE = Path(__file__).parent
 _RELEASES = _HERE / "releases.csv"
@@ -122,7 +122,7 @@ def main(
     known = [section.script for section in SECTIONS]
     if unknown := set(sections) - set(known):
         raise SystemExit(f"no such section: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
-    commit = commit_of(Path(__file__))
+    commit = str(provenance()["commit"])
     page = out / (commit + ("-quick" if quick else ""))
     again = commit == "none" or commit.endswith("-dirty")  # then the folder's name does not say what was measured
     records = []

@@ -16,7 +16,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.lazy import load
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train import cli
-from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, RESUMABLE
 from ballbot_train.commands.certify import certify
 
 
@@ -55,8 +55,8 @@ def test_optimize_writes_a_trajectory_that_starts_where_it_was_told(tmp_path, ty
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_one_line_of_help_that_is_its_own(name):
     function = load(COMMANDS[name])
-    assert help_of(name) == function.__doc__.strip().partition("\n")[0]
-    assert help_of(name).endswith(".")
+    assert cli._help_of(name) == function.__doc__.strip().partition("\n")[0]
+    assert cli._help_of(name).endswith(".")
 
 
 def test_the_commands_that_continue_are_those_that_do_much_work():

@@ -11,7 +11,7 @@ import pytest
 
 from ballbot_train.work import jobs
 from ballbot_train.work.executors import WorkerError
-from ballbot_train.work.provenance import commit_of
+from ballbot_train.work.provenance import _commit_of
 
 
 def squares(log, items):
@@ -195,10 +195,10 @@ def test_a_result_names_the_commit_of_the_checkout_that_tracks_the_code(tmp_path
     git("init")
     git("add", "a/b/tracked.py")
     git("commit", "-m", "first")
-    assert re.fullmatch("[0-9a-f]{7,}", commit_of(tracked))
-    assert commit_of(untracked) == "none"  # an installed package in somebody else's repository
+    assert re.fullmatch("[0-9a-f]{7,}", _commit_of(tracked))
+    assert _commit_of(untracked) == "none"  # an installed package in somebody else's repository
     tracked.write_text("changed")
-    assert commit_of(tracked).endswith("-dirty")
+    assert _commit_of(tracked).endswith("-dirty")
 
 
 def unpicklable(items):

@@ -15,7 +15,6 @@ from ballbot_train.learning import model_free, ppo, sac
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.model_free import demos_in_frame
 from ballbot_train.policy.files import shipped_policies
 from ballbot_train.policy.network import PolicyNetwork
 
@@ -252,7 +251,7 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
     observations = np.array([task.observe(*task.sample(rng, default_params())) for _ in range(20)], np.float32)
     actions = rng.uniform(-1, 1, (2, 20, 2)).astype(np.float32)
     flags, rewards = np.zeros(20, bool), np.zeros(20, np.float32)
-    framed = demos_in_frame(Demos(observations, actions[0], rewards, observations, flags, flags, actions[1]), frame)
+    framed = Demos(observations, actions[0], rewards, observations, flags, flags, actions[1]).in_frame(frame)
     assert framed.observations.shape == framed.next_observations.shape == (20, frame.size)
     for given, turned in zip(actions, (framed.actions, framed.executed), strict=True):
         for observation, action, there in zip(observations, given, turned, strict=True):

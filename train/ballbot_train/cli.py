@@ -3,6 +3,7 @@
 `ballbot --help` imports no command; any other call imports only its own.
 """
 
+import ast
 import difflib
 import logging
 import os
@@ -15,6 +16,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ except ModuleNotFoundError as error:
 
     sys.exit(str(missing("ballbot", error.name, "train")))
 
-from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE, help_of
+from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -227,10 +229,22 @@ def _print_help() -> None:
         table.add_column(style="bold", no_wrap=True, min_width=widest)
         table.add_column(overflow="fold")
         for name in names:
-            table.add_row(name, help_of(name))
+            table.add_row(name, _help_of(name))
         console.print(f"\n{group}:")
         console.print(table)
     console.print("\n`ballbot COMMAND --help` lists the options of a command; `ballbot --version` says the version.")
+
+
+def _help_of(name: str) -> str:
+    """The first line of a command's docstring, read from its file without importing it."""
+    module, _, function = COMMANDS[name].partition(":")
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == function:
+            return (ast.get_docstring(node) or "").partition("\n")[0]
+    return ""
 
 
 if __name__ == "__main__":

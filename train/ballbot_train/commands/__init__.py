@@ -3,10 +3,6 @@
 To add a command, write `NAME.py` with a function of the same name, and its name to `GROUPS`.
 """
 
-import ast
-from importlib.util import find_spec
-from pathlib import Path
-
 GROUPS = {
     "measure": ("benchmark", "evaluate", "compare", "robustness", "transfer", "basins", "submit", "verify"),
     "look": ("play", "page", "replay", "optimize", "paper"),
@@ -23,15 +19,3 @@ MOVED = {"tune": "`ballbot tune` is an example now: python examples/tune.py --ta
 
 RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train")
 """Commands that continue an interrupted run when they are started again; `train` does it with --resume."""
-
-
-def help_of(name: str) -> str:
-    """The first line of a command's docstring, read from its file without importing it."""
-    module, _, function = COMMANDS[name].partition(":")
-    spec = find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
-    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == function:
-            return (ast.get_docstring(node) or "").partition("\n")[0]
-    return ""

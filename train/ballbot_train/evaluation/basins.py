@@ -43,7 +43,7 @@ AXES: dict[str, _Axis] = {"speed": _Axis(4, 15.0, "speed ẋ, m/s"), "lean rate"
 
 
 @dataclass(frozen=True)
-class BasinMap:
+class _BasinMap:
     """One map: n leans, degrees, by n values of its axis; arrays are (values, leans)."""
 
     axis: str
@@ -64,7 +64,7 @@ class BasinMap:
 class Basins:
     """A map for each of `AXES`, of the same controllers."""
 
-    maps: tuple[BasinMap, ...]
+    maps: tuple[_BasinMap, ...]
 
     @classmethod
     def run(
@@ -184,7 +184,7 @@ def _maps_of(
     results: Iterable[Result],
     controllers: Sequence[str],
     points: int,
-) -> list[BasinMap]:
+) -> list[_BasinMap]:
     """The maps that the results of all states make up."""
     recovered = {name: {c: np.zeros((points, points), bool) for c in controllers} for name in bounds}
     for result in results:
@@ -196,5 +196,5 @@ def _maps_of(
     for name, boundary in bounds.items():
         leans, values = _grid(name, points)
         recoverable = np.logical_or.reduce([_within(boundary, leans, values), *recovered[name].values()])
-        maps.append(BasinMap(name, leans, values, boundary, recoverable, recovered[name]))
+        maps.append(_BasinMap(name, leans, values, boundary, recoverable, recovered[name]))
     return maps

@@ -6,10 +6,10 @@ from typing import Any, Literal
 import torch
 from torch.optim.swa_utils import AveragedModel
 
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym.robot import PAPER, Robot, named_robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy.files import Activation, PolicySpec
 from ballbot_train.policy.network import PolicyNetwork
 
@@ -95,8 +95,23 @@ def actor_for(
     if start is not None:
         return started(start, spec)
     made = PolicyNetwork(spec)
-    start_as_lqr(made, task, params)
+    _start_as_lqr(made, task, params)
     return made
+
+
+def _start_as_lqr(network: PolicyNetwork, task: Task, params: Robot) -> None:
+    """Sets the network's linear part to LQR's gain, or to zero if the task does not end at rest in an equilibrium.
+
+    Raises:
+        ValueError: the network has no linear part.
+    """
+    if network.linear is None:
+        raise ValueError("a network without a linear part cannot start as LQR")
+    with torch.no_grad():
+        for part in network.linear.parameters():
+            part.zero_()
+        if (gain := equilibrium_gain(task, params)) is not None:
+            network.linear.weight[:, : gain[0].shape[1]] = torch.tensor(gain[0])
 
 
 def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:

@@ -25,7 +25,7 @@ from ballbot_gym.vector.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, actor_for, average_of
 from ballbot_train.learning.routing import fit_routes
-from ballbot_train.learning.settings import MOST, MOST_ENVS, Settings, check_memory, number
+from ballbot_train.learning.settings import MOST, MOST_ENVS, Settings, number
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy.network import PolicyNetwork
 
@@ -102,7 +102,7 @@ class _Apg:
         self.config, self.iteration, self._own, self._seed, self._warm = config, 0, task, seed, start is not None
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self.task = replace(task, duration=config.episode_seconds)
-        check_memory(config.num_envs, self.task.steps)
+        config.check_memory(config.num_envs, self.task.steps)
         self._trained = actor_for(task, params, config, history, informed, start)
         self._average = average_of(self._trained, _AVERAGED_ITERATIONS)
         self._optimizer = torch.optim.Adam(self._trained.parameters(), config.learning_rate, betas=_BETAS)

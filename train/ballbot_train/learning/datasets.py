@@ -15,6 +15,7 @@ from ballbot_gym.checks import LARGEST
 from ballbot_gym.robot import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_parts
+from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_train.policy.files import OBSERVATION_VERSION
 from ballbot_train.work import shards
 from ballbot_train.work.console import option
@@ -74,6 +75,31 @@ class Demos:
         failed = self.terminations & ~arrived
         rewards = self.rewards - pay - arrived * pay * (task.steps - step - 1) - failed * failure_price
         return replace(self, rewards=rewards.astype(np.float32))
+
+    def in_frame(self, frame: Frame, reach: float = REACH) -> "Demos":
+        """The same steps with features instead of observations, and with actions in the frame, divided by `reach`."""
+        observations, axes = _seen_in(frame, self.observations)
+        next_observations, _ = _seen_in(frame, self.next_observations)
+        turned = {
+            name: np.einsum("nji,nj->ni", axes, getattr(self, name)) / np.float32(reach)
+            for name in ("actions", "executed")
+        }
+        return replace(self, observations=observations, next_observations=next_observations, **turned)
+
+
+def _seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a frame shows of observations (n, no), and where its axes are.
+
+    Returns:
+        Features (n, size) float32; and (n, 2, 2) float32, the frame's two directions as columns, which are orthonormal.
+    """
+    features, back = frame.features(tuple(observations.T))
+    one, zero = np.ones(len(observations), np.float32), np.zeros(len(observations), np.float32)
+    return _columns(features), np.stack([_columns(back(unit)) for unit in ((one, zero), (zero, one))], -1)
+
+
+def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*parts), -1).astype(np.float32)
 
 
 def load_demos(path: str | Path, task: Task, robot: str = PAPER) -> Demos:

@@ -7,11 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_baselines.feedback.lqr import equilibrium_gain
-from ballbot_gym.robot import Robot
-from ballbot_gym.tasks import Task
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy.network import PolicyNetwork
 
 
 @dataclass
@@ -91,18 +87,3 @@ class Fit:
 
 _STATE = ("network", "_optimizer")
 _DRAWN_AT_ONCE = 16  # batches, because drawing takes about as long for 16 as for one
-
-
-def start_as_lqr(network: PolicyNetwork, task: Task, params: Robot) -> None:
-    """Sets the network's linear part to LQR's gain, or to zero if the task does not end at rest in an equilibrium.
-
-    Raises:
-        ValueError: the network has no linear part.
-    """
-    if network.linear is None:
-        raise ValueError("a network without a linear part cannot start as LQR")
-    with torch.no_grad():
-        for part in network.linear.parameters():
-            part.zero_()
-        if (gain := equilibrium_gain(task, params)) is not None:
-            network.linear.weight[:, : gain[0].shape[1]] = torch.tensor(gain[0])

@@ -22,10 +22,10 @@ from ballbot_train.evaluation.fresh import make_envs
 from ballbot_train.learning.actors import Symmetry, average_of
 from ballbot_train.learning.critics import cost_to_go
 from ballbot_train.learning.curricula import CurriculumBatch
-from ballbot_train.learning.datasets import Demos
+from ballbot_train.learning.datasets import Demos, _seen_in
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.sb3 import BallbotVecEnv
-from ballbot_train.learning.settings import MOST, MOST_ENVS, Settings, check_memory, number
+from ballbot_train.learning.settings import MOST, MOST_ENVS, Settings, number
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy.network import PolicyNetwork
 
@@ -65,7 +65,7 @@ class ModelFreeConfig(Settings):
 
     def check(self) -> None:
         super().check()
-        check_memory(self.num_envs, self.num_steps)
+        self.check_memory(self.num_envs, self.num_steps)
 
 
 _REWARD_SCALE = 0.02  # of rewards that pay for living
@@ -473,32 +473,6 @@ def _global_random() -> dict[str, Any]:
     """The state of the global generators of torch and NumPy: tensors and plain values."""
     kind, words, *rest = cast(Any, np.random.get_state())
     return {"torch": torch.get_rng_state(), "numpy": [kind, words.tolist(), *rest]}
-
-
-def _seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a frame shows of observations (n, no), and where its axes are.
-
-    Returns:
-        Features (n, size) float32; and (n, 2, 2) float32, the frame's two directions as columns, which are orthonormal.
-    """
-    features, back = frame.features(tuple(observations.T))
-    one, zero = np.ones(len(observations), np.float32), np.zeros(len(observations), np.float32)
-    return _columns(features), np.stack([_columns(back(unit)) for unit in ((one, zero), (zero, one))], -1)
-
-
-def demos_in_frame(demos: Demos, frame: Frame, reach: float = REACH) -> Demos:
-    """Demonstrations with features instead of observations, and with actions in the frame, divided by `reach`."""
-    observations, axes = _seen_in(frame, demos.observations)
-    next_observations, _ = _seen_in(frame, demos.next_observations)
-    turned = {
-        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(reach)
-        for name in ("actions", "executed")
-    }
-    return replace(demos, observations=observations, next_observations=next_observations, **turned)
-
-
-def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
-    return np.stack(np.broadcast_arrays(*parts), -1).astype(np.float32)
 
 
 def _to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:

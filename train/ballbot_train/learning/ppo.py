@@ -23,7 +23,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, cost_to_go
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, demos_in_frame
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.learning.settings import number
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyNetwork
@@ -259,7 +259,7 @@ class _Ppo(ModelFree):
         given = None if demos is None else load_demos(demos, task, spec.robot)
         frame = spec.seen_in if _acts_in_frame(spec) else None
         if given is not None and frame is not None:
-            given = demos_in_frame(given, frame, 1.0)
+            given = given.in_frame(frame, 1.0)
         super().__init__(task, params, config, given, warm, frame, 1.0, backwards=config.backwards, **world)
         if frame is not None:
             self._env.action_space = gymnasium.spaces.Box(-_WIDE, _WIDE, (spec.actions,), np.float32)

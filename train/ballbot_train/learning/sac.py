@@ -26,7 +26,7 @@ from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig, demos_in_frame
+from ballbot_train.learning.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.learning.settings import MOST, number
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy.files import Mirrors
@@ -260,7 +260,7 @@ class _Sac(ModelFree):
         if given is not None and task.first_exit:
             given = given.without_pay(task, FAILURE_PRICE)
         if given is not None and frame is not None:
-            given = demos_in_frame(given, frame)
+            given = given.in_frame(frame)
         warm = demos is not None or start is not None
         super().__init__(task, params, config, given, warm, frame, control_dt=None if warm else _CONTROL_DT)
         self.config, self._imitation_weight = config, _IMITATION_WEIGHT

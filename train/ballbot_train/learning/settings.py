@@ -6,7 +6,7 @@ from typing import Any
 
 from ballbot_gym.checks import MOST_ENVS
 
-__all__ = ["MOST", "MOST_ENVS", "Settings", "check_memory", "number"]
+__all__ = ["MOST", "MOST_ENVS", "Settings", "number"]
 
 MOST = 10**9
 """The largest number of iterations, steps and the like."""
@@ -38,15 +38,6 @@ def _check(name: str, value: float, least: float, most: float, above: float | No
     raise ValueError(f"{name} must be {wanted}, not {value}")
 
 
-def check_memory(num_envs: int, steps: int) -> None:
-    """Raises a ValueError where an iteration has more env steps than fit into memory."""
-    if num_envs * steps > _MOST_STEPS:
-        raise ValueError(
-            f"{num_envs} envs of {steps} steps are {num_envs * steps} env steps per iteration, and at most {_MOST_STEPS} are "
-            "kept in memory; take fewer of either"
-        )
-
-
 @dataclass(frozen=True)
 class Settings:
     """Base class of settings, the learners' among them."""
@@ -58,3 +49,12 @@ class Settings:
                 value = getattr(self, each.name)
                 for one in value if isinstance(value, tuple) else [value]:
                     _check(each.name, one, **each.metadata)
+
+    @staticmethod
+    def check_memory(num_envs: int, steps: int) -> None:
+        """Raises a ValueError where an iteration has more env steps than fit into memory."""
+        if num_envs * steps > _MOST_STEPS:
+            raise ValueError(
+                f"{num_envs} envs of {steps} steps are {num_envs * steps} env steps per iteration, and at most {_MOST_STEPS} "
+                "are kept in memory; take fewer of either"
+            )

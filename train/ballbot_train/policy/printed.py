@@ -115,7 +115,7 @@ def _c(real: str, name: str, arguments: Sequence[str], lines: Sequence[str], ret
 
 
 @dataclass(frozen=True)
-class Language:
+class _Language:
     """How a language writes what C and JavaScript write differently."""
 
     mathematics: Callable[[str], str]
@@ -172,7 +172,7 @@ class Language:
         return self.frame(name, names, lines, returned)
 
 
-JAVASCRIPT = Language(
+JAVASCRIPT = _Language(
     lambda name: f"Math.{name.removeprefix('f') if name in ('fabs', 'fmin', 'fmax') else name}",
     _number,
     "const {0} = {1};",
@@ -181,7 +181,7 @@ JAVASCRIPT = Language(
 )
 """In double precision."""
 
-C = Language(
+C = _Language(
     lambda name: {"tanh": "squeezed"}.get(name, f"{name}f"),  # as exact, without branches
     _c_number,
     "const float {0} = {1};",
@@ -190,5 +190,5 @@ C = Language(
 )
 """C99 in single precision."""
 
-C_IN_DOUBLE = Language(str, _number, "const double {0} = {1};", partial(_c, "double"))
+C_IN_DOUBLE = _Language(str, _number, "const double {0} = {1};", partial(_c, "double"))
 """C99 in double precision, without networks."""

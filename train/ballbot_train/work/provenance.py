@@ -13,7 +13,7 @@ def provenance() -> dict[str, object]:
     """Version, commit, Python, libraries, machine and how much it has to do; "none" for what is not there."""
     return {
         "version": _version("ballbot-gym"),
-        "commit": commit_of(Path(__file__)),
+        "commit": _commit_of(Path(__file__)),
         "python": platform.python_version(),
         **{name: _version(name) for name in _PACKAGES},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
@@ -28,7 +28,7 @@ def _version(package: str) -> str:
         return "none"
 
 
-def commit_of(file: Path) -> str:
+def _commit_of(file: Path) -> str:
     """The commit of the checkout that tracks a file, as `git describe --always --dirty` says it.
 
     "none" where no folder above it is a checkout, where the checkout does not track it (an installed package in somebody
