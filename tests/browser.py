@@ -16,6 +16,7 @@ _FLAGS = (
     "disable-sync",
     "disable-dev-shm-usage",
     "enable-unsafe-swiftshader",  # WebGL without a GPU
+    "force-device-scale-factor=0.5",  # a quarter of the pixels, which the processor draws
 )
 
 

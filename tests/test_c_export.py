@@ -73,7 +73,7 @@ def test_a_compiled_controller_drives_certified_episodes_to_the_same_ends(task, 
     compiled = Compiled(tmp_path / "controller.c", task, made)
     env, episodes = BallbotEnv(task, physics="rk4"), certified.load(task, default_params())
     ends = []
-    for i in range(20):
+    for i in range(8):
         driven, own = (rollout(env, each, options=episodes.options(i)) for each in (compiled, made))
         ends.append(driven.success)
         assert (driven.success, driven.failure) == (own.success, own.failure)

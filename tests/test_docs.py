@@ -21,7 +21,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands import COMMANDS
 from ballbot_train.evaluation import adversarial, fresh
 from ballbot_train.evaluation.submissions import read_entries
-from ballbot_train.learning import model_free, training
+from ballbot_train.learning import dagger, model_free, training
 from ballbot_train.policy.files import SHIPPED, PolicyFile, shipped_ways
 from ballbot_train.report import figures
 from ballbot_train.work.executors import Workers
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
-    "dagger": "--iterations 1 --episodes-per-iteration 4 --gradient-steps 5",
+    "dagger": "--iterations 1 --episodes-per-iteration 2 --gradient-steps 5",
     "ppo": "--iterations 1 --num-envs 64 --num-steps 48",
     "apg": "--iterations 1 --num-envs 8 --episode-seconds 0.1",
 }
@@ -53,7 +53,8 @@ def pages_with(language):
 def test_python_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     learn = PPO.learn
-    monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, min(steps, 2048), *more))
+    monkeypatch.setattr("ballbot_train.evaluation.evaluate.checked_episodes", lambda episodes: min(episodes, 3))
+    monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, 1, *more))  # one rollout
     namespace = {"__name__": "example"}
     with classic_systems() if page.name == "classic.md" else nullcontext():
         for block in blocks(page, "python"):
@@ -78,14 +79,16 @@ def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: MEASURED_AS)
     monkeypatch.setattr(model_free, "_CLONE_ITERATIONS", 1)
+    monkeypatch.setattr(dagger, "_SECONDS", 0.5)
     for command in ("benchmark", "evaluate", "robustness"):
         monkeypatch.setattr(f"ballbot_train.commands.{command}.checked_episodes", lambda episodes: 2)
     monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
-    monkeypatch.setattr(fresh, "evaluate_fresh", lambda policy, task, count, *more: real(policy, task, 20, *more))
+    monkeypatch.setattr(fresh, "evaluate_fresh", lambda policy, task, count, *more: real(policy, task, 4, *more))
     optima = fresh.FreshResult.with_optima
     few = lambda result, count, workers: optima(result, min(count, 2), workers)  # noqa: E731
     monkeypatch.setattr(fresh.FreshResult, "with_optima", few)
-    monkeypatch.setattr(adversarial, "hard_starts", partial(adversarial.hard_starts, rounds=2))
+    monkeypatch.setattr(adversarial, "hard_starts", partial(adversarial.hard_starts, rounds=1))
+    monkeypatch.setattr(adversarial, "_CHECKED", 0)
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
         command = shlex.split(line, comments=True)
@@ -94,6 +97,9 @@ def test_commands_run(page, typed, monkeypatch):
         if line.endswith("# minutes"):
             assert command[:2] == ["ballbot", "train"], line
             command += shlex.split(f"{SHORTER[command[2]]} {MEASURED}")
+        if "--seconds" in command:
+            at = command.index("--seconds") + 1
+            command[at] = str(min(float(command[at]), 6.0))
         if command[0] == "make":  # what CI runs, this test within it
             assert re.search(rf"^{command[1]}:", makefile, flags=re.MULTILINE), line
             continue

@@ -1,5 +1,7 @@
+import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -60,10 +62,21 @@ def test_learning_curves_are_of_all_seeds_of_a_folder(capsys, tmp_path):
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_search_trains_with_proposed_settings_and_continues_its_study(capsys, tmp_path):
+def test_a_search_trains_with_proposed_settings_and_continues_its_study(capsys, tmp_path, typed, monkeypatch):
     pytest.importorskip("optuna")
+    example = script(EXAMPLES / "tune.py")
+    trained = []
+
+    def run(command, check):  # in this process, because each new one takes seconds to import what it needs
+        assert (command[1:3], check) == (["-m", "ballbot_train.cli"], True)
+        trained.append(typed(*command[3:]))
+        assert trained[-1][0] == 0, trained[-1][1]
+
+    own = SimpleNamespace(run=run, CalledProcessError=subprocess.CalledProcessError)
+    monkeypatch.setattr(example, "subprocess", own)
     tiny = "--iterations 1 --evaluations 1 --num-envs 4 --batch-size 16 --hidden 4 --test-episodes 1 --validation-episodes 2"
     for _ in range(2):  # the second time there is nothing left to do
-        script(EXAMPLES / "tune.py").main("stabilize", 1, 1, f"{tiny} --episode-seconds 1", tmp_path)
+        example.main("stabilize", 1, 1, f"{tiny} --episode-seconds 1", tmp_path)
+    assert len(trained) == 1
     assert capsys.readouterr().out.count("the best, trial 0, costs") == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["study.db", "trial-0"]

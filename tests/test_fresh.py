@@ -158,7 +158,7 @@ def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(monkeypatch)
 
 def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    evaluate("dagger", task="turn", fresh=60, optima=10, workers=1)
+    evaluate("dagger", task="turn", fresh=60, optima=1, workers=1)
     out = tmp_path / "runs" / "evaluate" / "turn-dagger"
     document = json.loads((out / "fresh.json").read_text())
     assert document["summary"][0]["episodes"] == 60
@@ -203,7 +203,7 @@ def test_validation_prices_an_episode_without_success_as_failing_at_once():
 
 
 def test_results_of_another_policy_are_not_replaced(tmp_path):
-    few: dict[str, Any] = {"task": "stabilize", "workers": 1, "out": tmp_path}
+    few: dict[str, Any] = {"task": "stabilize", "workers": 1, "optima": 0, "out": tmp_path}
     evaluate("shac", fresh=2, **few)
     before = (tmp_path / "fresh.json").read_bytes()
     for policy, other in (("ppo", {}), ("shac", {"robot": "rolling"}), ("shac", {"randomization": "late"})):

@@ -49,8 +49,8 @@ def test_cloning_without_demonstrations_says_what_it_needs():
 
 
 def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos):
-    task, params = make_task("stabilize"), default_params()
-    assert goes_on_as_if_never_stopped(lambda seed: dagger.make(task, params, TINY_DAGGER, 0, demos))
+    task, params, config = make_task("stabilize"), default_params(), replace(TINY_DAGGER, episodes_per_iteration=2)
+    assert goes_on_as_if_never_stopped(lambda seed: dagger.make(task, params, config, 0, demos))
 
 
 def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way(monkeypatch):
@@ -171,8 +171,8 @@ def test_dagger_falls_far_less_than_lqr_after_two_rounds():
     small = {
         "iterations": 4,
         "gathering_iterations": 2,
-        "episodes_per_iteration": 64,
-        "gradient_steps": 600,
+        "episodes_per_iteration": 32,
+        "gradient_steps": 300,
         "batch_size": 256,
         "hidden": (64,),
     }

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from ballbot_gym import TASKS, Stabilize, Trajectory, certified
+from ballbot_gym import TASKS, Stabilize, Trajectory, certified, files
 from ballbot_gym.robot import file_name
 from ballbot_train import evaluate
 from ballbot_train.commands import replay as replays
@@ -99,8 +99,11 @@ def two_policies(tmp_path: Path) -> list[str]:
     return paths
 
 
-def test_two_files_of_one_name_have_rows_and_recordings_of_their_own(two_policies: list[str], tmp_path: Path) -> None:
+def test_two_files_of_one_name_have_rows_and_recordings_of_their_own(
+    two_policies: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out"
+    monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
     benchmark(["stabilize"], two_policies, episodes=1, physics="rk4", out=out)
     text = (out / "leaderboard.md").read_text()
     assert "a/policy.json" in text

@@ -19,6 +19,7 @@ from ballbot_gym.vector.batch import BallbotBatch
 from ballbot_train import evaluate
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import SubmissionError, verify
+from ballbot_train.learning import dagger
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
@@ -268,7 +269,8 @@ def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
         ("dagger", {"episodes_per_iteration": 1, "gradient_steps": 2}),
     ],
 )
-def test_learners_command_three_motors(robot, learner, settings):
+def test_learners_command_three_motors(robot, learner, settings, monkeypatch):
+    monkeypatch.setattr(dagger, "_SECONDS", 0.5)  # of each episode
     task = make_task("stabilize", "omni", duration=3.0)
     algorithm = LEARNERS[learner]
     settings = dataclasses.replace(algorithm.settings("stabilize"), iterations=1, hidden=(8,), **settings)

@@ -171,7 +171,8 @@ def test_a_function_with_an_unknown_operation_is_refused():
 
 def test_a_forecast_is_what_the_policy_costs_in_the_end_and_never_less_than_the_optimum(engine, tmp_path):
     script = """
-    answer(DATA.scenarios.filter((scenario) => scenario.best).map((scenario) => {
+    const first = (scenario, i, all) => all.findIndex(({ task }) => task === scenario.task) === i;
+    answer(DATA.scenarios.filter((scenario) => scenario.best).filter(first).map((scenario) => {
       const policy = new Policy(DATA.policies[scenario.task], MODELS[scenario.task]), robot = new Robot(policy, scenario);
       const forecast = new Forecast(robot, scenario), shares = [];
       while (!robot.over) {
@@ -183,7 +184,7 @@ def test_a_forecast_is_what_the_policy_costs_in_the_end_and_never_less_than_the_
     }));
     """
     found = run_in_node(engine + script, tmp_path)
-    assert len(found) == 16
+    assert len(found) == len(TASKS)
     for run in found:
         assert run["shares"] == pytest.approx([run["share"]] * len(run["shares"]))
         assert len(run["shares"]) > 20

@@ -71,7 +71,7 @@ def test_everybody_sees_the_newest_moment_and_those_who_come_later_too(viewer, p
 
 
 def test_a_client_that_reads_nothing_holds_up_nobody(viewer, params):
-    path = (GroundPath(np.zeros((20_000, 2)), "#e08a00"),)
+    long = "x" * 2_000_000
     with Visitor(viewer.port) as other:
         stuck = socket.create_connection(("127.0.0.1", viewer.port))
         stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -79,9 +79,9 @@ def test_a_client_that_reads_nothing_holds_up_nobody(viewer, params):
         head = f"GET /stream HTTP/1.1\r\nHost: localhost:{viewer.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         stuck.sendall(f"{head}{key}\r\n".encode())
         wait_for(lambda: len(viewer._clients) == 2)
-        for k in range(40):  # 8 MB
-            viewer.draw(Drawing(params, (Drawn(STATE + k),), path))
-        wait_for(lambda: other.seen.get("moment", {"robots": [{"x": [0]}]})["robots"][0]["x"][0] == 39.5)
+        for k in range(4):  # 8 MB
+            viewer.draw(Drawing(params, (Drawn(STATE + k, label=long),)))
+            wait_for(lambda k=k: other.seen.get("moment", {"robots": [{"x": [0]}]})["robots"][0]["x"][0] == 0.5 + k)
         began = time.monotonic()
         viewer.close()  # which does not wait for it either
         assert time.monotonic() - began < 5
