@@ -25,8 +25,11 @@ test: $(VENV)/installed
 types: $(VENV)/installed
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
+# One worker more than there are cores, because some tests wait for a browser or another process.
+WORKERS ?= $(shell expr 1 + $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2))
+
 pytest: $(VENV)/installed
-	$(BIN)/pytest -m "not slow" -n auto --dist worksteal
+	$(BIN)/pytest -m "not slow" -n $(WORKERS) --dist worksteal
 
 test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
