@@ -159,6 +159,8 @@ class StepCode:
 
     def __init__(self, problem: StepProblem, function: Any):
         self._problem = problem
+        self._nominal: Robot | None = None
+        self._numbers: list[float] = []
         results, given, fixed = problem.results(), problem.of_step(), problem.of_episode()
         count, arguments, constant = (sum(sizes.values()) for sizes in (results, given, fixed))
         memory = bytearray(8 * (count + arguments + constant))
@@ -193,8 +195,10 @@ class StepCode:
     def begin(self, c: Numbers, drawn: Numbers, robot: Robot, model: Robot) -> None:
         """Takes what stays the same during an episode: constants, draws, the nominal robot and that of the episode."""
         problem = self._problem
+        if robot is not self._nominal:  # which is the same in every episode
+            self._nominal, self._numbers = robot, problem.numbers(robot)
         varied = problem.numbers(model) if problem.variation.varies_robot else ()
-        self._fixed[:] = (*c, *drawn, *problem.numbers(robot), *varied)
+        self._fixed[:] = (*c, *drawn, *self._numbers, *varied)
 
     def step(
         self, state: StepState, action: Numbers, z: Draws, moved: tuple[Numbers, Numbers, float] | None
