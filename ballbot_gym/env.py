@@ -286,7 +286,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
                 "the episode has ended; call reset()" if self._now else "step() before reset()"
             )
         parts = self._checked(action)
-        made, measured, seen, *arrays = self._advance(parts)
+        made, measured, seen, x, force = self._advance(parts)
         self._now, did = made.state, made.outcome
         self._steps_left -= 1
         terminated = did.terminated > 0
@@ -294,7 +294,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             self._steps_left = 0
         if self._human:
             self.render()
-        info = self._info(made, measured, *arrays)
+        info = self._info(made, measured, x, force)
         return self._with_past(seen, parts), did.reward, terminated, did.truncated > 0, info
 
     def _advance(self, action: tuple[float, ...]) -> tuple[Step, State, np.ndarray, np.ndarray, np.ndarray]:
@@ -494,7 +494,6 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             "reward_survive": survive,
             "reward_cost": running,
             "reward_goal": goal,
-            **dict(zip(self._measured, measured, strict=True)),
             "success": success,
             "is_success": success,
             "failure": failed > 0,
@@ -504,6 +503,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             "clipped": made.clipped > 0,
             "constants": self._constants.copy(),
         }
+        info.update(zip(self._measured, measured, strict=True))
         if made.grip:
             info["grip"] = np.array(made.grip)
         if self._varies:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from operator import itemgetter
 from types import ModuleType
 from typing import Any
 
@@ -43,10 +44,8 @@ class _MujocoSimulator(Simulator):
         self._mujoco = import_mujoco()
         self._mj_step = self._mujoco.mj_step
         kinds = self._mujoco.mjtWarning
-        self._instabilities = [
-            int(kind)
-            for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_INERTIA)
-        ]
+        instabilities = kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_INERTIA
+        self._instabilities = itemgetter(*map(int, instabilities))
         self._make(params)
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
@@ -71,7 +70,7 @@ class _MujocoSimulator(Simulator):
 
         After most of these warnings MuJoCo puts the robot back to its origin, at rest.
         """
-        return bool(self._warned[self._instabilities].any())
+        return any(self._instabilities(self._warned.tolist()))
 
     def _make(self, params: Any) -> None:
         self._params = params
