@@ -1,120 +1,23 @@
-"""Proves that certified optima are strict local minima of the problem as the environment computes it.
+"""Proves that certified optima are strict local minima of the problem as the environment computes it: all of them, in files.
 
-`local_minimum.py` states the theorem and checks its hypotheses in interval arithmetic (`intervals.py`); a reader who trusts
-nothing reads these two files. Forces come from the certified set. A set has the forces of its first episodes alone; those of
-the others are searched again, and their costs are compared. Distances between forces are shares of the force limit, so of
-actions in [−1, 1].
+`ballbot prove --check` proves those of the first episodes and writes no file. The theorem is at the top of
+`ballbot_baselines/proofs/local_minimum.py`, and a reader who trusts nothing reads that file and `intervals.py` next to it.
 
 It writes enclosures.csv with a line for each episode, and prints a line for each task. It ends with exit status 1 if an
 optimum was not proven. An interrupted run continues in its folder.
 """
 
 import sys
-import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import tyro
-from local_minimum import NotProvenError, Problem, prove
-from stationary import stationary
 
-from ballbot_baselines import Optimum, find_optima, find_optimum
-from ballbot_baselines.optimum.batched import multistart
-from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_baselines.proofs.minima import _lines, _summary
 from ballbot_gym import certified, files
-from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, Robot, named_robot
-from ballbot_gym.rollout import PlanError
-from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.trajectory import Trajectory
+from ballbot_gym.tasks import TASKS
 from ballbot_train.work import jobs
 
-NEAR = 5e-6
-"""Largest distance of a minimum from the stored forces: five times the reserve that the solvers keep from a goal."""
-SAME_COST = 1e-5
-"""Largest difference between a stored cost and that of the minimum: what these reserves cost is less."""
-_BELOW = 1e-9  # by which a stored cost may be too low, from rounding and the tolerance of solvers
 _TOGETHER = 20  # episodes of a job
-_GUESSES = 200  # random ones, where the other searches do not come to the stored cost
-
-
-def enclosed(problem: Problem, motion: Trajectory, cost: float, stored: bool = True) -> jobs.Entry:
-    """Proves that there is a strict local minimum near a motion, of nearly this cost.
-
-    Args:
-        problem: the episode.
-        motion: states and forces.
-        cost: the certified cost.
-        stored: whether the forces are those of the certificate, so that the minimum must be near them.
-
-    Raises:
-        ArithmeticError: it could not be proven; the message names the hypothesis that fails.
-    """
-    point, linear = stationary(problem, motion.x, motion.u)
-    found = prove(problem, point, linear)
-    limit = problem.robot.force_limit
-    distance = float((np.abs(point.u - motion.u) + found.radius).max()) / limit
-    if stored and not distance < NEAR:
-        raise NotProvenError(f"the minimum is {distance:.2g} of the force limit away from the stored forces")
-    above = cost - found.low
-    if not -_BELOW < above < SAME_COST:
-        raise NotProvenError(f"the minimum costs {found.low:.9g}, and not the certified {cost:.9g}")
-    return {
-        "radius": float(found.radius.max()) / limit,
-        "distance": distance if stored else None,
-        "cost": found.low,
-        "cost_width": found.high - found.low,
-        "stored_above": above,
-        "rounding": found.rounding,
-        "forces_at_bound": int(point.fixed.sum()),
-        "active_constraints": len(point.rows),
-        "least_multiplier": float(point.mu.min()) if point.rows else None,
-    }
-
-
-def lines(name: str, indices: Sequence[int]) -> Iterator[jobs.Entry]:
-    """A line for each of some episodes of a task."""
-    task, robot = make_task(name, PAPER), named_robot(PAPER)
-    known = certified.load(task, robot)
-    others = [i for i in indices if i >= len(known.trajectories)]
-    searched = find_optima(task, robot, known.states[others], known.constants[others]) if others else []
-    found = dict(zip(others, searched, strict=True))
-    for i in indices:
-        began, cost, stored = time.perf_counter(), float(known.costs[i]), i < len(known.trajectories)
-        line: jobs.Entry = {"task": name, "episode": i, "proven": 0, "why_not": ""}
-        try:
-            motion = known.trajectories[i] if stored else _again(task, robot, known, i, found[i])
-            line |= enclosed(Problem(task, robot, tuple(known.constants[i].tolist())), motion, cost, stored)
-            line["proven"] = 1
-        except (ArithmeticError, PlanError) as error:
-            line["why_not"] = str(error)
-        yield line | {"seconds": time.perf_counter() - began}
-
-
-def _again(task: Task, robot: Robot, known: certified.EvaluationSet, i: int, found: Optimum | None) -> Trajectory:
-    """The motion of a certified episode whose forces are not stored: of the first search that comes to the stored cost."""
-    x0, c = known.states[i], known.constants[i]
-    episode = Shooting(task, robot, x0, c, Backoff())
-
-    def searches() -> Iterator[Optimum | None]:
-        yield found
-        yield find_optimum(task, robot, x0, c, twice=True)
-        yield multistart(task, robot, x0[None], c[None], _GUESSES)[0][0]
-
-    motion = None
-    for optimum in searches():
-        if optimum is None:
-            continue
-        x, u = optimum.trajectory.x, optimum.trajectory.u
-        near = episode.solve_to_the_end(x, u / robot.force_limit, near=True)[-1]
-        motion = Trajectory(optimum.trajectory.t, near.states, robot.force_limit * near.inputs)
-        same_length = len(u) == round(known.durations[i] / task.control_dt)
-        if near.is_optimal and same_length and abs(near.cost - known.costs[i]) < SAME_COST:
-            break
-    if motion is None:
-        raise PlanError("no search found a motion")
-    return motion
 
 
 def main(
@@ -136,7 +39,7 @@ def main(
     work = [
         jobs.Job(
             f"{name}-{first:03d}",
-            lines,
+            _lines,
             (name,),
             tuple(range(first, min(first + _TOGETHER, episodes))),
             f"minima of {name}",
@@ -153,23 +56,6 @@ def main(
     folder.release()
     if not all(row["proven"] for row in rows):
         sys.exit(1)
-
-
-def _summary(name: str, rows: Sequence[jobs.Entry]) -> str:
-    proven = [row for row in rows if row["proven"]]
-    parts = [f"{name}: {len(proven)} of {len(rows)} minima enclosed, {sum(row['seconds'] for row in rows):.0f} s"]
-    if proven:
-        near = [row["distance"] for row in proven if row["distance"] is not None]
-        above = [abs(row["stored_above"]) for row in proven]
-        parts += [
-            f"radius at most {max(row['radius'] for row in proven):.1e} of the force limit; {sum(d < 1e-6 for d in near)} of "
-            f"{len(near)} within 1e-6 of stored forces, the farthest {max(near, default=0.0):.1e}",
-            f"cost enclosed to {max(row['cost_width'] for row in proven):.1e}; {sum(a < 1e-9 for a in above)} stored costs "
-            f"within 1e-9 of it, the farthest {max(above):.1e} away",
-            f"a step of the environment is rounded by at most {max(row['rounding'] for row in proven):.1e}",
-        ]
-    parts += [f"episode {row['episode']}: {row['why_not']}" for row in rows if not row["proven"]]
-    return "\n  ".join(parts)
 
 
 if __name__ == "__main__":

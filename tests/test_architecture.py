@@ -22,7 +22,7 @@ ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for 
 # The rooms from the bottom to the top. A file imports from its own room and from those below it only.
 ROOMS = (
     "ballbot_gym",
-    *("solvers", "optimum", "feedback", "identification", "paper", "ballbot_baselines"),
+    *("solvers", "optimum", "proofs", "feedback", "identification", "paper", "ballbot_baselines"),
     *("ballbot_train", "work", "policy", "evaluation", "learning", "report", "commands"),
 )
 

@@ -1,8 +1,6 @@
 """Proofs that optima are local minima: interval arithmetic holds what it should, and a changed optimum is refused."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +10,19 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import named_robot
 
 pytest.importorskip("casadi")
-sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
 
-from enclosures import enclosed
-from intervals import VARIABLES, Ball, derivatives, variables
-from local_minimum import Curvature, Linear, NotProvenError, Point, Problem, parts_of, residual
-from stationary import stationary
+from ballbot_baselines.proofs.intervals import VARIABLES, _Ball, _derivatives, _variables
+from ballbot_baselines.proofs.local_minimum import (
+    _Curvature,
+    _Linear,
+    _NotProvenError,
+    _parts_of,
+    _Point,
+    _Problem,
+    _residual,
+)
+from ballbot_baselines.proofs.minima import _enclosed
+from ballbot_baselines.proofs.stationary import _stationary
 
 DIGITS = 80
 
@@ -29,8 +34,8 @@ def test_balls_hold_a_step_and_its_derivatives_in_80_digits(radius: float, digit
     scale = np.array([2, 2, 0.8, 0.8, 3, 3, 2, 2, 200, 200])
     middle = (rng.uniform(-1, 1, VARIABLES) * scale).astype(digits)
     point = middle + (radius * rng.uniform(-1, 1, VARIABLES)).astype(digits)
-    jets = variables(Ball(middle[None], np.full((1, VARIABLES), radius)), 2)
-    value, slope, bend = derivatives(robot.step(jets[:8], jets[8:], 0.02))
+    jets = _variables(_Ball(middle[None], np.full((1, VARIABLES), radius)), 2)
+    value, slope, bend = _derivatives(robot.step(jets[:8], jets[8:], 0.02))
     with mpmath.workdps(DIGITS):
         exact = [mpmath.mpf(float(a)) + mpmath.mpf(float(a - digits(float(a)))) for a in point]
 
@@ -40,7 +45,7 @@ def test_balls_hold_a_step_and_its_derivatives_in_80_digits(radius: float, digit
                 moved[i] += sign * h
             return list(robot.step(tuple(moved[:8]), tuple(moved[8:]), 0.02))
 
-        def inside(numbers: list, ball: Ball) -> bool:
+        def inside(numbers: list, ball: _Ball) -> bool:
             pairs = zip(numbers, ball.m, ball.r, strict=True)
             middles = ((x, mpmath.mpf(float(m)) + mpmath.mpf(float(m - digits(float(m)))), r) for x, m, r in pairs)
             return all(abs(x - m) <= r + mpmath.mpf(10) ** -25 for x, m, r in middles)
@@ -63,11 +68,11 @@ def short():
     """The problem, the motion and the cost of a certified turn of 40 steps, whose goal has four active constraints."""
     task, robot = make_task("turn"), named_robot("paper")
     known = certified.load(task, robot)
-    return Problem(task, robot, tuple(known.constants[4].tolist())), known.trajectories[4], float(known.costs[4])
+    return _Problem(task, robot, tuple(known.constants[4].tolist())), known.trajectories[4], float(known.costs[4])
 
 
 def test_a_certified_turn_is_a_strict_local_minimum(short):
-    found = enclosed(*short)
+    found = _enclosed(*short)
     assert found["radius"] < 1e-9
     assert found["cost_width"] < 1e-9
     assert found["active_constraints"] == 4
@@ -77,33 +82,52 @@ def test_a_force_or_a_cost_that_differs_in_its_fifth_digit_is_refused(short):
     problem, motion, cost = short
     forces = motion.u.copy()
     forces[np.unravel_index(np.abs(forces).argmax(), forces.shape)] *= 1 + 1e-4
-    with pytest.raises(NotProvenError, match="stored forces"):
-        enclosed(problem, replace(motion, u=forces), cost)
-    with pytest.raises(NotProvenError, match="certified"):
-        enclosed(problem, motion, cost * (1 + 1e-4))
+    with pytest.raises(_NotProvenError, match="stored forces"):
+        _enclosed(problem, replace(motion, u=forces), cost)
+    with pytest.raises(_NotProvenError, match="certified"):
+        _enclosed(problem, motion, cost * (1 + 1e-4))
+
+
+def test_the_command_proves_stored_minima_and_refuses_a_set_that_was_changed_in_its_fifth_digit(monkeypatch, capsys):
+    prove = pytest.importorskip("ballbot_train.commands.prove").prove
+    prove(check=True, tasks=("turn",), episodes=1)
+    assert "1 of 1 minima enclosed" in capsys.readouterr().out
+    known = certified.load(make_task("turn"), named_robot("paper"))
+    motion = known.trajectories[0]
+    forces = motion.u.copy()
+    forces[3] *= 1 + 1e-4
+    changed = (
+        replace(known, costs=known.costs * (1 + 1e-4)),
+        replace(known, trajectories=[replace(motion, u=forces), *known.trajectories[1:]]),
+    )
+    for wrong in changed:
+        monkeypatch.setattr(certified, "load", lambda *_, wrong=wrong: wrong)
+        with pytest.raises(ValueError, match="1 of 1 minima could not be proven"):
+            prove(check=True, tasks=("turn",), episodes=1)
+        assert "0 of 1 minima enclosed" in capsys.readouterr().out
 
 
 def test_a_motion_that_is_no_optimum_is_refused(short):
     problem, motion, cost = short
     with pytest.raises(ArithmeticError):
-        enclosed(problem, replace(motion, u=0.5 * motion.u), cost)
+        _enclosed(problem, replace(motion, u=0.5 * motion.u), cost)
 
 
 def test_the_conditions_change_as_the_linear_model_says_up_to_the_bound_of_the_theorem(short) -> None:
     """F(z) − F(0) − Mz is the mean of (F' − M)z on the way to z, and F is nearly quadratic: half of the bound is reached."""
     problem, motion, _ = short
-    point, m = stationary(problem, motion.x, motion.u)
+    point, m = _stationary(problem, motion.x, motion.u)
     rng, size = np.random.default_rng(0), 1e-6
     box = tuple(np.full(part.shape, size) for part in (point.x, point.u, point.x, point.mu))
     box[0][0] = 0.0
-    inside = moved(point, m, *(Ball(np.zeros(part.shape), part) for part in box))
-    bounds = Curvature(inside, parts_of(problem, inside.x, inside.u, 2), m).variation(box)
+    inside = moved(point, m, *(_Ball(np.zeros(part.shape), part) for part in box))
+    bounds = _Curvature(inside, _parts_of(problem, inside.x, inside.u, 2), m).variation(box)
     dx, v, w, nu = (part * rng.choice([-1, 1], part.shape) for part in box)
     near = moved(point, m, dx, v, w, nu)
     change = [
         after.m - before.m
         for after, before in zip(
-            *(residual(each, parts_of(problem, Ball(each.x), Ball(each.u), 1), m) for each in (near, point)),
+            *(_residual(each, _parts_of(problem, _Ball(each.x), _Ball(each.u), 1), m) for each in (near, point)),
             strict=True,
         )
     ]
@@ -120,7 +144,7 @@ def times(matrices, vectors):
     return (matrices @ vectors[..., None])[..., 0]
 
 
-def moved(point: Point, m: Linear, dx, v, w, nu) -> Point:
+def moved(point: _Point, m: _Linear, dx, v, w, nu) -> _Point:
     """The point at z = (dx, v, w, nu) of the theorem."""
     return replace(
         point,

@@ -7,7 +7,7 @@ GROUPS = {
     "measure": ("benchmark", "evaluate", "compare", "robustness", "transfer", "basins", "submit", "verify"),
     "look": ("play", "page", "replay", "optimize", "paper"),
     "train": ("train", "demos"),
-    "make": ("new", "identify", "certify", "export"),
+    "make": ("new", "identify", "certify", "prove", "export"),
 }
 """The commands by what they are for, in the order of `ballbot --help`."""
 

@@ -3,8 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
-from intervals import Ball
-from local_minimum import Linear, NotProvenError, Parts, Point, Problem, parts_of, residual
+
+from ballbot_baselines.proofs.intervals import _Ball
+from ballbot_baselines.proofs.local_minimum import (
+    _Linear,
+    _NotProvenError,
+    _Parts,
+    _parts_of,
+    _Point,
+    _Problem,
+    _residual,
+)
 
 # a force this share of its limit from it counts as active, and a constraint whose value is below this
 _ACTIVE_FORCE, _ACTIVE = 1e-6, 1e-5
@@ -15,7 +24,7 @@ _WEIGHTS = (0.0, 10.0, 100.0, 1e3, 1e4)  # of squared active constraints, tried 
 _MORE = 5.0  # times the least of these: near the least possible weight the model is nearly singular
 
 
-def stationary(problem: Problem, x: np.ndarray, u: np.ndarray) -> tuple[Point, Linear]:
+def _stationary(problem: _Problem, x: np.ndarray, u: np.ndarray) -> tuple[_Point, _Linear]:
     """The stationary point near a motion x (n+1, 8), u (n, 2), in longdouble, with the linear model about it.
 
     Raises:
@@ -23,8 +32,8 @@ def stationary(problem: Problem, x: np.ndarray, u: np.ndarray) -> tuple[Point, L
     """
     limit = problem.robot.force_limit
     fixed = np.abs(u) > limit * (1 - _ACTIVE_FORCE)
-    point = Point(x, np.where(fixed, np.sign(u) * limit, u), np.zeros_like(x), np.zeros(0), fixed, ())
-    parts = parts_of(problem, Ball(point.x), Ball(point.u), 2)
+    point = _Point(x, np.where(fixed, np.sign(u) * limit, u), np.zeros_like(x), np.zeros(0), fixed, ())
+    parts = _parts_of(problem, _Ball(point.x), _Ball(point.u), 2)
     rows = _violated(point, parts, _ACTIVE)
     point = replace(point, rows=rows, mu=np.zeros(len(rows)))
     point = _with_multipliers(point, parts)
@@ -36,11 +45,11 @@ def stationary(problem: Problem, x: np.ndarray, u: np.ndarray) -> tuple[Point, L
         same = point.rows == moved.rows and (point.fixed == moved.fixed).all()
         if same and size < _CONVERGED:
             return _refined(problem, point, linear), linear
-        parts = parts_of(problem, Ball(point.x), Ball(point.u), 2)
-    raise NotProvenError(f"Newton's method did not converge: its last step is {size:.2g} of the force limit")
+        parts = _parts_of(problem, _Ball(point.x), _Ball(point.u), 2)
+    raise _NotProvenError(f"Newton's method did not converge: its last step is {size:.2g} of the force limit")
 
 
-def _violated(point: Point, parts: Parts, below: float) -> tuple[tuple[int, int], ...]:
+def _violated(point: _Point, parts: _Parts, below: float) -> tuple[tuple[int, int], ...]:
     """Constraints whose values are below a number."""
     return tuple(
         (int(k), int(i))
@@ -49,7 +58,7 @@ def _violated(point: Point, parts: Parts, below: float) -> tuple[tuple[int, int]
     )
 
 
-def _with_active_set(moved: Point, parts: Parts, limit: float) -> Point:
+def _with_active_set(moved: _Point, parts: _Parts, limit: float) -> _Point:
     """A point whose forces at their bounds and active constraints have multipliers of the right sign."""
     slope = parts.cost[1].m[:, 0] + (moved.lam[1:, None] @ parts.step[1].m)[:, 0]
     over = ~moved.fixed & (np.abs(moved.u) > limit)
@@ -61,16 +70,16 @@ def _with_active_set(moved: Point, parts: Parts, limit: float) -> Point:
     return replace(moved, u=u, fixed=fixed, rows=tuple(row for row, _ in rows), mu=np.array([mu for _, mu in rows]))
 
 
-def _linear(point: Point, parts: Parts) -> Linear:
+def _linear(point: _Point, parts: _Parts) -> _Linear:
     """The linear model, with a weight well above the least one for which a Riccati recursion finds a minimum."""
     for weight in _WEIGHTS:
         found = _riccati(point, parts, weight)
         if found is not None:
             return found if weight == 0 else _riccati(point, parts, _MORE * weight) or found
-    raise NotProvenError("the second variation is not positive: this is no minimum")
+    raise _NotProvenError("the second variation is not positive: this is no minimum")
 
 
-def _riccati(point: Point, parts: Parts, weight: float, lagrangian: bool = True) -> Linear | None:
+def _riccati(point: _Point, parts: _Parts, weight: float, lagrangian: bool = True) -> _Linear | None:
     """The Riccati recursion of the Lagrangian's second-order model, or of the cost's alone; None without a minimum."""
     n, free = len(point.u), np.concatenate([np.ones((len(point.u), 8)), ~point.fixed], 1)
     lam = point.lam.astype(np.float64) * lagrangian
@@ -97,10 +106,10 @@ def _riccati(point: Point, parts: Parts, weight: float, lagrangian: bool = True)
         p[i] = total[:8, :8] - total[:8, 8:] @ k[i]
         p[i] = 0.5 * (p[i] + p[i].T)
     b = slope[:, :, 8:]
-    return Linear(slope[:, :, :8] - b @ k, b, g, g @ np.swapaxes(b, 1, 2), k, p, slopes, weight, r)
+    return _Linear(slope[:, :, :8] - b @ k, b, g, g @ np.swapaxes(b, 1, 2), k, p, slopes, weight, r)
 
 
-def _solved(linear: Linear, steps: np.ndarray, forces: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, ...]:
+def _solved(linear: _Linear, steps: np.ndarray, forces: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, ...]:
     """M⁻¹ of right-hand sides (n, 8, q), (n, 2, q), (n+1, 8, q)."""
     w, v, dx = states.copy(), forces.copy(), np.zeros_like(states)
     for k in reversed(range(len(steps))):
@@ -111,16 +120,17 @@ def _solved(linear: Linear, steps: np.ndarray, forces: np.ndarray, states: np.nd
     return dx, v, w
 
 
-def _newton(point: Point, parts: Parts, linear: Linear) -> Point:
+def _newton(point: _Point, parts: _Parts, linear: _Linear) -> _Point:
     """The point after one step of Newton's method."""
-    steps, forces, states, active = (part.m.astype(np.float64) for part in residual(point, parts, linear))
-    dx, v, w = _solved(linear, *(-part[..., None] for part in (steps, forces, states)))
+    steps, forces, states, active = (part.m.astype(np.float64) for part in _residual(point, parts, linear))
+    dx, v, w = _solved(linear, -steps[..., None], -forces[..., None], -states[..., None])
     nu = np.zeros(0)
     if point.rows:
         border = np.zeros((*states.shape, len(point.rows)))
         for j, (k, _) in enumerate(point.rows):
             border[k, :, j] = linear.slopes[j]
-        columns = _solved(linear, *(np.zeros((*part.shape, len(point.rows))) for part in (steps, forces)), border)
+        none = np.zeros((*steps.shape, len(point.rows))), np.zeros((*forces.shape, len(point.rows)))
+        columns = _solved(linear, none[0], none[1], border)
         rows = list(zip((k for k, _ in point.rows), linear.slopes, strict=True))
         nu = np.linalg.solve(
             np.array([slope @ columns[0][k] for k, slope in rows]),
@@ -137,21 +147,21 @@ def _newton(point: Point, parts: Parts, linear: Linear) -> Point:
     )
 
 
-def _refined(problem: Problem, point: Point, linear: Linear) -> Point:
+def _refined(problem: _Problem, point: _Point, linear: _Linear) -> _Point:
     """The point with more digits."""
     x, u, lam, mu = (part.astype(np.longdouble) for part in (point.x, point.u, point.lam, point.mu))
     point = replace(point, x=x, u=u, lam=lam, mu=mu)
     for _ in range(2):
-        point = _newton(point, parts_of(problem, Ball(point.x), Ball(point.u), 1), linear)
+        point = _newton(point, _parts_of(problem, _Ball(point.x), _Ball(point.u), 1), linear)
     return point
 
 
-def _with_multipliers(point: Point, parts: Parts) -> Point:
+def _with_multipliers(point: _Point, parts: _Parts) -> _Point:
     """The point with the multipliers for which the forces' slopes are least, by the adjoint of the closed loop."""
     n, m = len(point.u), len(point.rows)
     linear = _riccati(point, parts, _WEIGHTS[1], lagrangian=False)
     if linear is None:
-        raise NotProvenError("the cost is not convex")
+        raise _NotProvenError("the cost is not convex")
     slope = parts.cost[1].m[:, 0]
     along_u = slope[:, 8:] * ~point.fixed
     lam, forces = np.zeros((n + 1, 8, m + 1)), np.zeros((n, 2, m + 1))

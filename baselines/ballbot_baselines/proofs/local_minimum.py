@@ -31,8 +31,8 @@ from typing import Any
 
 import casadi
 import numpy as np
-from intervals import Ball, derivatives, join, variables
 
+from ballbot_baselines.proofs.intervals import _Ball, _derivatives, _join, _variables
 from ballbot_gym.robot import Robot
 from ballbot_gym.tasks import Task
 
@@ -46,12 +46,12 @@ _LEAST = (1e-13, 1e-11, 1e-13, 1e-13)  # of the box, m, N and so on: so that no 
 _CURVED = (2, 3, 6, 7, 8, 9)
 
 
-class NotProvenError(ArithmeticError):
+class _NotProvenError(ArithmeticError):
     """A hypothesis of the theorem could not be verified; the message names it."""
 
 
 @dataclass(frozen=True)
-class Problem:
+class _Problem:
     """An episode: the task, the robot and the constants (nc,)."""
 
     task: Task
@@ -80,7 +80,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Point:
+class _Point:
     """A motion with its multipliers, and which constraints are active: arrays, perhaps longdouble, or balls over a box.
 
     | field | shape | meaning |
@@ -100,7 +100,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Linear:
+class _Linear:
     """M of the theorem: a (n, 8, 8), b (n, 8, 2), g (n, 2, 2), gb ≈ g bᵀ (n, 2, 8), gains k (n, 2, 8), p (n+1, 8, 8), the
     slopes of the active constraints (m, 8), the weight of their squares, and the curvature r (n, 2, 2) of forces.
     """
@@ -117,18 +117,18 @@ class Linear:
 
 
 @dataclass(frozen=True)
-class Parts:
+class _Parts:
     """Values, gradients and Hessians of the step, its cost and its constraints along a motion."""
 
-    step: tuple[Ball, Ball, Ball]
-    cost: tuple[Ball, Ball, Ball]
-    limits: tuple[Ball, Ball, Ball]
+    step: tuple[_Ball, _Ball, _Ball]
+    cost: tuple[_Ball, _Ball, _Ball]
+    limits: tuple[_Ball, _Ball, _Ball]
     ends: int
     """Index of the first constraint that holds in the last state alone."""
 
 
 @dataclass(frozen=True)
-class Minimum:
+class _Minimum:
     """What was proven: within `radius` of u there is a strict local minimum, and its cost is within [low, high].
 
     `rounding` bounds what one step of the environment in float64 differs from the real function.
@@ -140,20 +140,20 @@ class Minimum:
     rounding: float
 
 
-def parts_of(problem: Problem, x: Ball, u: Ball, order: int) -> Parts:
+def _parts_of(problem: _Problem, x: _Ball, u: _Ball, order: int) -> _Parts:
     """The functions of a problem along a motion x (n+1, 8), u (n, 2) with derivatives of order 1 or 2."""
     task, robot = problem.task, problem.robot
     dt = task.control_dt
-    points = join(lambda parts: np.concatenate(parts, 1), [x[:-1], u])
-    jets = variables(points, order, _CURVED)
-    step = derivatives(robot.step(jets[:8], jets[8:], dt, robot.substeps(dt)))
-    jets = variables(points, order)
+    points = _join(lambda parts: np.concatenate(parts, 1), [x[:-1], u])
+    jets = _variables(points, order, _CURVED)
+    step = _derivatives(robot.step(jets[:8], jets[8:], dt, robot.substeps(dt)))
+    jets = _variables(points, order)
     states, forces = jets[:8], jets[8:]
-    cost = derivatives((task.cost(states, forces, problem.c) * dt,))
+    cost = _derivatives((task.cost(states, forces, problem.c) * dt,))
     padded = x.mapped(lambda a: np.concatenate([a, np.zeros((len(a), 2), a.dtype)], 1))
-    states = variables(padded, order)[:8]
+    states = _variables(padded, order)[:8]
     limits, goals = problem.limits(states), problem.goals(states)
-    return Parts(step, cost, derivatives((*limits, *goals)), len(limits))
+    return _Parts(step, cost, _derivatives((*limits, *goals)), len(limits))
 
 
 def _times(matrices: Any, vectors: Any) -> Any:
@@ -172,26 +172,26 @@ def _turned(a: np.ndarray) -> np.ndarray:
     return np.swapaxes(a, -1, -2)
 
 
-def _slopes(point: Point, parts: Parts) -> Ball:
+def _slopes(point: _Point, parts: _Parts) -> _Ball:
     """Slopes (n, 10) of the Hamiltonian with respect to states and forces."""
     return parts.cost[1][:, 0] + (point.lam[1:, None] @ parts.step[1])[:, 0]
 
 
-def gradients(point: Point, parts: Parts) -> tuple[Ball, Ball]:
+def _gradients(point: _Point, parts: _Parts) -> tuple[_Ball, _Ball]:
     """Slopes of the Lagrangian with respect to x_k (n+1, 8), without the weight of squares, and to u_k (n, 2)."""
     slope = _slopes(point, parts)
-    along_x = join(np.concatenate, [slope[:, :8], 0.0 * parts.limits[1][-1:, 0, :8]]) - point.lam
+    along_x = _join(np.concatenate, [slope[:, :8], 0.0 * parts.limits[1][-1:, 0, :8]]) - point.lam
     rows = [along_x[k] for k in range(len(point.x))]
     for (k, i), mu in zip(point.rows, point.mu, strict=True):
         rows[k] = rows[k] - parts.limits[1][k, i, :8] * mu
-    return join(np.stack, rows), slope[:, 8:]
+    return _join(np.stack, rows), slope[:, 8:]
 
 
-def residual(point: Point, parts: Parts, linear: Linear) -> tuple[Ball, Ball, Ball, Ball]:
+def _residual(point: _Point, parts: _Parts, linear: _Linear) -> tuple[_Ball, _Ball, _Ball, _Ball]:
     """F(0): of the steps (n, 8), of the forces (n, 2), of the states (n+1, 8) and of the active constraints (m,)."""
     n = len(point.u)
     steps = point.x[1:] - parts.step[0]
-    along_x, along_u = gradients(point, parts)
+    along_x, along_u = _gradients(point, parts)
     along_u = along_u * (~point.fixed).astype(np.float64)
     states = [-along_x[k] for k in range(n + 1)]
     active = [parts.limits[0][k, i] for k, i in point.rows]
@@ -200,19 +200,19 @@ def residual(point: Point, parts: Parts, linear: Linear) -> tuple[Ball, Ball, Ba
     price = _times(linear.p[1:], steps)
     forces = _times(linear.g, along_u - _times(_turned(linear.b), price))
     more = _times(_turned(linear.k), along_u) + _times(_turned(linear.a), price)
-    states = join(np.stack, states)
-    states = join(np.concatenate, [states[:n] + more, states[n:]])
-    return steps, forces, states, join(np.array, active) if active else Ball.exact(np.zeros(0))
+    states = _join(np.stack, states)
+    states = _join(np.concatenate, [states[:n] + more, states[n:]])
+    return steps, forces, states, _join(np.array, active) if active else _Ball.exact(np.zeros(0))
 
 
-Box = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Box = tuple[np.ndarray, ...]
 """|δx| (n+1, 8), |v| (n, 2), |w| (n+1, 8), |ν| (m,), or bounds of the four parts of F in the order of `residual`."""
 
 
-class Inverse:
+class _Inverse:
     """C of the theorem: |C|, and what it leaves of M."""
 
-    def __init__(self, point: Point, linear: Linear):
+    def __init__(self, point: _Point, linear: _Linear):
         self._linear, self._rows, n = linear, point.rows, len(point.u)
         a, b, gb = linear.a, linear.b, linear.gb
         # one row for each component of F; columns are those of δx, of w or of v
@@ -239,10 +239,10 @@ class Inverse:
                 blocks[0][...] -= gb[k].T @ of_forces[2 * k : 2 * k + 2]
                 blocks[2][:, 2 * k : 2 * k + 2] = -gb[k].T
         self._border = np.array([columns[j] for j in range(len(columns))]).reshape(len(columns), 2 * size + 2 * n)
-        schur = Ball.exact(np.zeros((len(columns), len(columns))))
+        schur = _Ball.exact(np.zeros((len(columns), len(columns))))
         if columns:
             at = np.array([self._border[:, 8 * k : 8 * k + 8] for k, _ in point.rows])  # (m, m, 8)
-            schur = (Ball.exact(at) @ linear.slopes[:, :, None])[..., 0]
+            schur = (_Ball.exact(at) @ linear.slopes[:, :, None])[..., 0]
         self.schur = np.linalg.inv(schur.m)
         self._defect = (self.schur @ schur - np.eye(len(columns))).most
         self._states, self._steps, self._forces = of_states, of_steps, np.abs(of_forces)
@@ -277,7 +277,7 @@ class Inverse:
         return x, every[16 * n + 16 :].reshape(n, 2), w, nu
 
 
-def prove(problem: Problem, point: Point, linear: Linear) -> Minimum:
+def _prove(problem: _Problem, point: _Point, linear: _Linear) -> _Minimum:
     """Proves that there is a strict local minimum near a point.
 
     Raises:
@@ -287,10 +287,10 @@ def prove(problem: Problem, point: Point, linear: Linear) -> Minimum:
     moves = linear.k[fixed], _turned(linear.b)[fixed], linear.g[fixed.any(1)][:, [0, 1], [1, 0]]
     limit = problem.robot.force_limit
     if any(part.any() for part in moves) or not (np.abs(point.u[fixed]) == limit).all():
-        raise NotProvenError("a force that is said to be at its bound moves")
-    thin = parts_of(problem, Ball.exact(point.x), Ball.exact(point.u), 1)
-    at_point = tuple(part.most for part in residual(point, thin, linear))
-    inverse = Inverse(point, linear)
+        raise _NotProvenError("a force that is said to be at its bound moves")
+    thin = _parts_of(problem, _Ball.exact(point.x), _Ball.exact(point.u), 1)
+    at_point = tuple(part.most for part in _residual(point, thin, linear))
+    inverse = _Inverse(point, linear)
     nothing = (
         np.zeros_like(linear.p[:, 0]),
         np.zeros(point.u.shape),
@@ -301,11 +301,11 @@ def prove(problem: Problem, point: Point, linear: Linear) -> Minimum:
     box = tuple(2 * part + least for part, least in zip(inverse.bound(at_point, nothing), _LEAST, strict=True))
     box[0][0], box[1][point.fixed] = 0.0, 0.0
     forces = (_times(np.abs(linear.k), box[0][:-1]) + box[1]) * _UP * ~point.fixed
-    x, u = Ball.around(point.x, box[0]), Ball.around(point.u, forces)
-    parts = parts_of(problem, x, u, 2)
-    multipliers = Ball.around(point.lam, (_times(np.abs(linear.p), box[0]) + box[2]) * _UP)
-    inside = Point(x, u, multipliers, Ball.around(point.mu, box[3]), point.fixed, point.rows)
-    curvature = Curvature(inside, parts, linear)
+    x, u = _Ball.around(point.x, box[0]), _Ball.around(point.u, forces)
+    parts = _parts_of(problem, x, u, 2)
+    multipliers = _Ball.around(point.lam, (_times(np.abs(linear.p), box[0]) + box[2]) * _UP)
+    inside = _Point(x, u, multipliers, _Ball.around(point.mu, box[3]), point.fixed, point.rows)
+    curvature = _Curvature(inside, parts, linear)
     variation = curvature.variation(box)
     right = tuple(a + b * _UP for a, b in zip(at_point, variation, strict=True))
     image = inverse.bound(right, box)
@@ -313,34 +313,34 @@ def prove(problem: Problem, point: Point, linear: Linear) -> Minimum:
     unknown = ((part[0][1:], part[1][free], part[2][1:], part[3]) for part in (image, box))
     for new, old in zip(*unknown, strict=True):
         if not (new < old).all():
-            raise NotProvenError(f"the contraction: a component is {np.max(new / old):.3g} of what the test allows")
+            raise _NotProvenError(f"the contraction: a component is {np.max(new / old):.3g} of what the test allows")
     _check_constraints(problem, inside, parts)
     curvature.check_definite()
     low, high = _cost(point, thin, curvature, box, forces)
-    return Minimum(
+    return _Minimum(
         (_times(np.abs(linear.k), image[0][:-1]) + image[1]) * _UP * free, low, high, _rounding(problem, point)
     )
 
 
-class Curvature:
+class _Curvature:
     """Second derivatives of the Lagrangian over a box."""
 
-    def __init__(self, inside: Point, parts: Parts, linear: Linear):
+    def __init__(self, inside: _Point, parts: _Parts, linear: _Linear):
         self.inside, self.parts, self.linear, n = inside, parts, linear, len(inside.fixed)
         free = np.concatenate([np.ones((n, 8)), ~inside.fixed], 1)
         bend = parts.step[2].mapped(lambda a: a.reshape(n, 8, -1))
         bend = (inside.lam[1:, None] @ bend)[:, 0].mapped(lambda a: a.reshape(n, 10, 10))
         hessian = (parts.cost[2][:, 0] + bend) * (free[:, None] * free[:, :, None])
         hessian = hessian + np.array([np.diag(row) for row in 1.0 - free])
-        states = [hessian[k, :8, :8] for k in range(n)] + [Ball.exact(np.zeros((8, 8)))]
+        states = [hessian[k, :8, :8] for k in range(n)] + [_Ball.exact(np.zeros((8, 8)))]
         self.slopes = [parts.limits[1][k, i, :8] for k, i in inside.rows]
         for j, (k, i) in enumerate(inside.rows):
-            square = Ball.exact(linear.slopes[j][:, None]) * self.slopes[j][None] * linear.weight
+            square = _Ball.exact(linear.slopes[j][:, None]) * self.slopes[j][None] * linear.weight
             states[k] = states[k] + square - parts.limits[2][k, i, :8, :8] * inside.mu[j]
-        self.last, self.along_x = states[n], join(np.stack, states[:n])
+        self.last, self.along_x = states[n], _join(np.stack, states[:n])
         self.mixed, self.along_u = hessian[:, 8:, :8], hessian[:, 8:, 8:]
         slope = parts.step[1] * free[:, None]
-        a, b, k, before, after = slope[:, :, :8], slope[:, :, 8:], linear.k, linear.p[:-1], Ball.exact(linear.p[1:])
+        a, b, k, before, after = slope[:, :, :8], slope[:, :, 8:], linear.k, linear.p[:-1], _Ball.exact(linear.p[1:])
         self.closed, self.b = a - b @ k, b
         # second variation in δx and v, with P: nearly 0, 0 and r
         forced = self.mixed - self.along_u @ k
@@ -357,7 +357,7 @@ class Curvature:
         (dx, v, w, nu), linear = box, self.linear
         a, b, after = self.closed - linear.a, self.b - linear.b, linear.p[1:]
         steps = _times(a.most, dx[:-1]) + _times(b.most, v)
-        g = Ball.exact(linear.g)
+        g = _Ball.exact(linear.g)
         forces = _times((g @ self.ev_x).most, dx[:-1]) + _times((g @ self.ev_v - np.eye(2)).most, v)
         forces += _times((g @ (b.T @ after)).most, dx[1:]) + _times((g @ self.b.T - linear.gb).most, w[1:])
         states = np.zeros_like(dx)
@@ -374,8 +374,8 @@ class Curvature:
     def check_definite(self) -> None:
         """Raises an error unless the second variation is positive definite over the box."""
         linear, n = self.linear, len(self.inside.fixed)
-        after = Ball.exact(linear.p[1:])
-        off = join(
+        after = _Ball.exact(linear.p[1:])
+        off = _join(
             np.concatenate,
             [self.xx + self.closed.T @ (after @ self.closed) - linear.p[:-1], (self.last - linear.p[-1])[None]],
         )
@@ -391,8 +391,8 @@ class Curvature:
             total = self.xx.m[k] + a.T @ later @ a - vx.T @ turn[k]
             lowered[k] = 0.5 * (total + total.T) - np.diag(room[k])
         scale = 1 / np.sqrt(room)
-        root = Ball.exact(np.linalg.inv(np.linalg.cholesky(linear.r)))
-        after, turn = Ball.exact(lowered[1:]), Ball.exact(turn)
+        root = _Ball.exact(np.linalg.inv(np.linalg.cholesky(linear.r)))
+        after, turn = _Ball.exact(lowered[1:]), _Ball.exact(turn)
         xx = self.xx + self.closed.T @ (after @ self.closed) - lowered[:-1]
         vx, vv = self.vx + self.b.T @ (after @ self.closed), self.along_u + self.b.T @ (after @ self.b)
         left = vx - vv @ turn
@@ -403,37 +403,37 @@ class Curvature:
         squares = (squares + np.square((vv - np.eye(2)).most).sum((1, 2))) * _UP
         last = ((self.last - lowered[-1]) * (scale[-1][:, None] * scale[-1]) - np.eye(8)).most
         if not (squares < 1).all() or not np.square(last).sum() * _UP < 1:
-            raise NotProvenError(f"the second variation: {np.sqrt(squares.max()):.3g} is not below 1")
+            raise _NotProvenError(f"the second variation: {np.sqrt(squares.max()):.3g} is not below 1")
 
 
-def _check_constraints(problem: Problem, inside: Point, parts: Parts) -> None:
+def _check_constraints(problem: _Problem, inside: _Point, parts: _Parts) -> None:
     """Raises an error unless active constraints press and all others hold strictly over the box."""
     limit, fixed = problem.robot.force_limit, inside.fixed
     multipliers, forces = inside.mu.least, inside.u.most
     if not (multipliers > 0).all():
-        raise NotProvenError(f"strict complementarity: a multiplier may be {multipliers.min():.3g}")
+        raise _NotProvenError(f"strict complementarity: a multiplier may be {multipliers.min():.3g}")
     if not (forces[~fixed] < limit).all():
-        raise NotProvenError("a free force may exceed its bound")
+        raise _NotProvenError("a free force may exceed its bound")
     inwards = (-_slopes(inside, parts)[:, 8:] * np.sign(inside.u.m)).least[fixed]
     if not (inwards > 0).all():
-        raise NotProvenError(f"strict complementarity: the multiplier of a force may be {inwards.min():.3g}")
+        raise _NotProvenError(f"strict complementarity: the multiplier of a force may be {inwards.min():.3g}")
     n, values, limits = len(fixed), parts.limits[0], parts.ends
     holds = values.least > 0
     for k, i in inside.rows:
         holds[k, i] = True
     if not holds[1:, :limits].all() or not holds[n].all():
-        raise NotProvenError("a constraint that is not active may be violated")
+        raise _NotProvenError("a constraint that is not active may be violated")
     if values.m.shape[1] > limits and not ((-values).least[1:n, limits:] > 0).any(1).all():
-        raise NotProvenError("the goal may be reached earlier")
+        raise _NotProvenError("the goal may be reached earlier")
 
 
-def _cost(point: Point, thin: Parts, curvature: Curvature, box: Box, forces: np.ndarray) -> tuple[float, float]:
+def _cost(point: _Point, thin: _Parts, curvature: _Curvature, box: Box, forces: np.ndarray) -> tuple[float, float]:
     """Bounds of the cost of the minimum: the Lagrangian's value, slopes and curvature times the box."""
     value = thin.cost[0][:, 0] + (point.lam[1:] * (thin.step[0] - point.x[1:])) @ np.ones(8)
-    total = sum((value[k] for k in range(1, len(value.m))), value[0])
+    total: Any = sum((value[k] for k in range(1, len(value.m))), value[0])
     for (k, i), mu in zip(point.rows, point.mu, strict=True):
         total = total - thin.limits[0][k, i] * mu
-    along_x, along_u = gradients(point, thin)
+    along_x, along_u = _gradients(point, thin)
     dx = box[0]
     bend = np.zeros((len(dx), 8, 8))
     bend[:-1], bend[-1] = curvature.along_x.most, curvature.last.most
@@ -450,9 +450,9 @@ def _cost(point: Point, thin: Parts, curvature: Curvature, box: Box, forces: np.
     return float(np.nextafter(middle - spread, -np.inf)), float(np.nextafter(middle + spread, np.inf))
 
 
-def _rounding(problem: Problem, point: Point) -> float:
+def _rounding(problem: _Problem, point: _Point) -> float:
     """Bound of what a step of the environment in float64 differs from the real function in states of the motion."""
     robot, dt = problem.robot, problem.task.control_dt
     x, u = point.x.astype(np.float64), point.u.astype(np.float64)
-    real = parts_of(problem, Ball.exact(x), Ball.exact(u), 1).step[0]
+    real = _parts_of(problem, _Ball.exact(x), _Ball.exact(u), 1).step[0]
     return float((real - robot.step(x[:-1], u, dt, robot.substeps(dt))).most.max())
