@@ -23,7 +23,7 @@ _NUMBERS = (float, int)  # a tuple, because a union would be made in every call
 def _library(a: Any) -> ModuleType:
     """The library of `a`, or this project's module that defines its class. It is already imported, because `a` exists."""
     module = type(a).__module__
-    return sys.modules.get(module if module.startswith("ballbot_") else module.partition(".")[0], np)
+    return sys.modules.get(module if module[:8] == "ballbot_" else module.partition(".")[0], np)
 
 
 def sin(a: Any) -> Any:
