@@ -9,6 +9,12 @@ where the likelihood is that of `likelihood`. Its second derivative is I + H wit
 the inverse of that is the covariance of z. If an eigenvalue of H is far above 1, the log determines the combination of
 parameters that is its eigenvector. If an eigenvalue is below 1, the prior has more information than the log, and the
 combination stays near that of the nominal robot.
+
+Intervals are wider than this covariance for two reasons. Innovations of a robot that differs from the equations of motion may
+be correlated in time. Then the log says less than H. So the estimate is repeated without each of the blocks of the log in
+turn, one Newton step each (the jackknife over blocks, as in Künsch, "The jackknife and the bootstrap for general stationary
+observations", 1989), and deviations are those of that spread where it is larger. And a robot may follow the equations very
+well with other numbers than those that it has. No log shows that. So every number has an error of the model besides.
 """
 
 from collections.abc import Callable
@@ -27,7 +33,17 @@ _SPREADS = {
     "wheels.no_load_speed": 0.2, "wheels.inertia": 0.4, "wheels.damping": 0.7, "wheels.spin_friction": 0.7,
 }  # fmt: skip
 """Standard deviation of the logarithm of a robot's number: 0.2 is about 20 %."""
-_DELAY, _LAG, _LAG_SPREAD = 0.03, 0.004, 1.2  # s, s, and of the logarithm
+_MODEL_ERRORS = {
+    "com_height": 0.002, "inertia": 0.005, "axial_inertia": 0.005, "force_limit": 0.001, "body_mass": 0.002,
+    "ball_mass": 0.002, "wheels.no_load_speed": 0.01, "wheels.inertia": 0.015, "wheels.damping": 0.05,
+    "wheels.spin_friction": 0.005,
+}  # fmt: skip
+"""How far, as a share, the numbers with which the equations follow a robot are from its own. This is about what PyBullet and
+MuJoCo, in steps of 1 and 2 ms, differ from the equations; see docs/identify.md."""
+_DELAY_ERROR = 3e-4  # s, the same of the delay
+_BLOCK = 2.0  # s
+_BEGINNING = 10.0  # s of each log, from which the search for the estimate of all begins
+_DELAY, _LAG = 0.03, 0.005  # s; a lag below 0 has no meaning, but a search needs no end there
 _BIASES = {"lean": 0.03, "lean_rate": 0.02, "gyro": 0.02, "accel": 0.2}  # rad, rad/s, rad/s, m/s²
 _NOISES = {
     "position": 0.005, "lean": 0.005, "speed": 0.03, "lean_rate": 0.02, "heading": 0.01, "heading_rate": 0.02,
@@ -116,7 +132,7 @@ class Problem:
         ]
         drive = [
             _Parameter("delay", "s", 0.0, _DELAY, positive=False),
-            _Parameter("lag", "s", _LAG, _LAG_SPREAD, positive=True),
+            _Parameter("lag", "s", 0.0, _LAG, positive=False),
         ]
         biases = [
             _Parameter(f"{name} bias", "", 0.0, _BIASES[Readings.group_of(name)], positive=False)
@@ -130,11 +146,15 @@ class Problem:
         drifts = [_Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in _DRIFTS.items()]
         return [each for each in [*robot, *drive, *biases, *noises, *drifts] if each.nominal > 0 or not each.positive]
 
+    @property
+    def model_errors(self) -> np.ndarray:
+        """(p,) standard deviations in spreads, by which z differs from the robot's own because equations are not exact."""
+        errors = _MODEL_ERRORS | {"delay": _DELAY_ERROR}
+        return np.array([errors.get(each.name, 0.0) / each.spread for each in self.parameters])
+
     def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Values (B,) by name, of lanes z (B, p); those that are known too."""
-        held = {
-            each.name: np.full(len(z), 0.0 if each.name == "lag" else each.nominal) for each in self._all_parameters()
-        }
+        held = {each.name: np.full(len(z), each.nominal) for each in self._all_parameters()}
         return held | {each.name: each.value(z[:, i]) for i, each in enumerate(self.parameters)}
 
     def robot_of(self, values: dict[str, Any]) -> Ballbot:
@@ -178,23 +198,42 @@ class Problem:
         S' are central differences.
         """
         count = len(z)
-        around = z + _DIFFERENCE * np.vstack([np.zeros((1, count)), np.eye(count), -np.eye(count)])
         value, slope, curvature = 0.0, np.zeros(count), np.zeros((count, count))
-        for log in logs:
-            with np.errstate(all="ignore"):  # of filters that fail
-                found = Innovations.of(self.robot, log, self.lanes(around))
-            missed, variance, moved, widened = _differences(found, count)
-            scale = 1 / np.sqrt(variance)
-            first, second = moved * scale[:, None], widened / variance[:, None]
-            value += 0.5 * float(np.sum(np.log(variance) + missed**2 / variance))
-            slope += np.einsum("npm,nm->p", first, missed * scale)
-            slope += 0.5 * np.einsum("npm,nm->p", second, 1 - missed**2 / variance)
-            for weight, part in ((1.0, first), (0.5, second)):
-                flat = part.transpose(1, 0, 2).reshape(count, -1)
-                curvature += weight * flat @ flat.T
+        with np.errstate(all="ignore"):  # of filters that fail
+            for log in logs:
+                missed, variance, first, second = self._derivatives(log, z)
+                scale = 1 / np.sqrt(variance)
+                value += 0.5 * float(np.sum(np.log(variance) + missed**2 / variance))
+                slope += np.einsum("npm,nm->p", first, missed * scale)
+                slope += 0.5 * np.einsum("npm,nm->p", second, 1 - missed**2 / variance)
+                for weight, part in ((1.0, first), (0.5, second)):
+                    flat = part.transpose(1, 0, 2).reshape(count, -1)
+                    curvature += weight * flat @ flat.T
         if not (np.isfinite(value) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
             return np.inf, np.zeros(count), np.eye(count)
         return value, slope, curvature
+
+    def _derivatives(self, log: Readings, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """ν and S (n, m) of a log at z (p,), and their derivatives ν'/√S and S'/S (n, p, m)."""
+        count = len(z)
+        around = z + _DIFFERENCE * np.vstack([np.zeros((1, count)), np.eye(count), -np.eye(count)])
+        found = Innovations.of(self.robot, log, self.lanes(around))
+        missed, variance, moved, widened = _differences(found, count)
+        return missed, variance, moved * (1 / np.sqrt(variance))[:, None], widened / variance[:, None]
+
+    def blocks(self, logs: list[Readings], z: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes (K, p) and Fisher information (K, p, p) at z (p,) of K blocks of time of logs, each of about `seconds`."""
+        slopes, curvatures = [], []
+        for log in logs:
+            missed, variance, first, second = self._derivatives(log, z)
+            slope = np.einsum("npm,nm->np", first, missed / np.sqrt(variance))
+            slope += 0.5 * np.einsum("npm,nm->np", second, 1 - missed**2 / variance)
+            count = max(1, round((log.t[-1] - log.t[0]) / seconds))
+            for own in np.array_split(np.arange(len(log.t)), count):
+                a, b = (part[own].transpose(1, 0, 2).reshape(len(z), -1) for part in (first, second))
+                slopes.append(slope[own].sum(axis=0))
+                curvatures.append(a @ a.T + 0.5 * b @ b.T)
+        return np.array(slopes), np.array(curvatures)
 
     def most_likely(self, logs: list[Readings], watch: Callable[[int], object] = lambda done: None) -> "Found":
         """The most likely parameters of logs with the same readings.
@@ -208,10 +247,13 @@ class Problem:
         Raises:
             ValueError: the logs are so far from what the robot can do that the filter fails.
         """
-        z, _, rounds = _minimum(self, logs, np.zeros(len(self.parameters)), watch, 0)
+        z, rounds = np.zeros(len(self.parameters)), 0
+        beginnings = [log.between(0, int(np.searchsorted(log.t, log.t[0] + _BEGINNING))) for log in logs]
+        for part in (beginnings, logs) if sum(log.t[-1] - log.t[0] for log in logs) > 2 * _BEGINNING else (logs,):
+            z, _, rounds = _minimum(self, part, z, watch, rounds)
         kept, outliers = zip(*[_without_outliers(self, log, z) for log in logs], strict=True)
         z, found, rounds = _minimum(self, list(kept), z, watch, rounds)
-        return Found(self, z, found, rounds, sum(outliers))
+        return Found(self, z, found, rounds, sum(outliers), _widening(*self.blocks(list(kept), z, _BLOCK)))
 
 
 _UNITS = {
@@ -232,6 +274,7 @@ class Found:
     | information | (p, p) | H, of the log alone, in spreads |
     | rounds | | how often the likelihood was computed |
     | outliers | | readings that were left out because their innovations are too large to be noise |
+    | widening | (p,) | by how much the deviations exceed those of uncorrelated innovations, at least 1 |
     """
 
     problem: Problem
@@ -239,11 +282,13 @@ class Found:
     information: np.ndarray
     rounds: int
     outliers: int = 0
+    widening: np.ndarray | float = 1.0
 
     @property
     def covariance(self) -> np.ndarray:
-        """(p, p) of z, from log and prior."""
-        return np.linalg.inv(self.information + np.eye(len(self.z)))
+        """(p, p) of z, from log, prior and the error of the model."""
+        own, widening = np.linalg.inv(self.information + np.eye(len(self.z))), np.ones(len(self.z)) * self.widening
+        return widening[:, None] * own * widening + np.diag(self.problem.model_errors**2)
 
     @property
     def robot(self) -> Ballbot:
@@ -312,6 +357,19 @@ def _minimum(
         callback=end_near,
     )  # fmt: skip
     return found.x, at(found.x)[2] - np.eye(len(start)), rounds + len(known)
+
+
+def _widening(slopes: np.ndarray, curvatures: np.ndarray) -> np.ndarray:
+    """(p,) deviations by the jackknife over blocks, with slopes (K, p) and information (K, p, p), over those by information.
+
+    At least 1: few blocks do not show that intervals are too wide.
+    """
+    count, prior = len(slopes), np.eye(slopes.shape[1])
+    whole = curvatures.sum(axis=0) + prior
+    usual = np.linalg.inv(whole)
+    moved = np.linalg.solve(whole - curvatures, slopes[..., None])[..., 0]
+    spread = (count - 1) / count * moved.T @ moved + usual @ usual  # the prior is not left out
+    return np.sqrt(np.maximum(1.0, np.diag(spread) / np.diag(usual)))
 
 
 def _without_outliers(problem: Problem, log: Readings, z: np.ndarray) -> tuple[Readings, int]:

@@ -15,7 +15,7 @@ is installed.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import casadi
@@ -39,6 +39,7 @@ _COMMANDS = {2: ("command_x", "command_y"), 3: ("command_1", "command_2", "comma
 _POSES = {0, 1, 2, 3, 8}  # components of a state without noise of their own: their rates have it
 _START = np.array([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.5, 0.5, 0.1, 0.5, 0.5])
 """Standard deviation of each component of a state that is not read, before the first reading, SI units."""
+_MOST_LEAD = 0.3  # of a step
 _MANY = 8000  # operations of a function on which the compiler would spend minutes with all optimizations
 
 
@@ -53,6 +54,7 @@ class Readings:
     | y | (n, m) | readings; NaN where there is none |
     | commands | (n, k) | in units of the robot's action, each from its time until the next |
     | delays | m | s, by which readings are about an earlier time than theirs; () for none |
+    | windows | m | s, over which readings are means, about that earlier time; () for none |
     | restarts | | indices of the first readings after gaps |
     | guessed | (n, k) | standard deviation of commands that are not in the log; None where all are |
     """
@@ -64,6 +66,7 @@ class Readings:
     delays: tuple[float, ...] = ()
     restarts: tuple[int, ...] = ()
     guessed: np.ndarray | None = None
+    windows: tuple[float, ...] = ()
 
     @staticmethod
     def readable(robot: Ballbot) -> dict[str, str]:
@@ -90,7 +93,9 @@ class Readings:
         """The readings from index `first` until before `last`."""
         cut, restarts = slice(first, last), tuple(i - first for i in self.restarts if first < i < last)
         guessed = None if self.guessed is None else self.guessed[cut]
-        return Readings(self.names, self.t[cut], self.y[cut], self.commands[cut], self.delays, restarts, guessed)
+        return Readings(
+            self.names, self.t[cut], self.y[cut], self.commands[cut], self.delays, restarts, guessed, self.windows
+        )
 
     @property
     def dt(self) -> float:
@@ -134,9 +139,9 @@ class Lanes(NamedTuple):
     strength: np.ndarray
     """(B,) ratio of the applied force to the command."""
     delay: np.ndarray
-    """(B,) s, by which the force follows the command later than the readings do."""
+    """(B,) s, by which the force follows the command later than the readings do, on average, the lag included."""
     lag: np.ndarray
-    """(B,) s, time constant of the force."""
+    """(B,) s, the part of it by which a first-order response follows; a little below 0 it is ahead."""
     bias: np.ndarray
     """(B, m) of the readings."""
     noise: np.ndarray
@@ -157,17 +162,40 @@ class Lanes(NamedTuple):
         """
         t, commands = readings.t, readings.commands
         ends = np.append(t, t[-1] + readings.dt)
-        total = np.concatenate([np.zeros((1, commands.shape[1])), np.cumsum(commands * np.diff(ends)[:, None], axis=0)])
-        before = ends[:, None] - self.delay  # (n + 1, B)
-        sums = np.stack([np.interp(before, ends, column) for column in total.T], axis=-1)
-        # the first command is taken for those before
-        early = np.minimum(before - ends[0], 0.0)[..., None] * commands[0]
-        late = np.maximum(before - ends[-1], 0.0)[..., None] * commands[-1]
-        forces = np.diff(sums + early + late, axis=0) / np.diff(ends)[:, None, None]
-        share = 1 - np.exp(-np.diff(ends)[:, None] / np.maximum(self.lag, 1e-9))
+        impulses = _impulses(ends, commands, ends[:, None] - (self.delay - self.lag))
+        forces = np.diff(impulses, axis=0) / np.diff(ends)[:, None, None]
+        dt = np.diff(ends)[:, None]
+        share = dt / (dt + np.maximum(self.lag, -_MOST_LEAD * dt))  # of a response that lags by this time on average
         for i in range(1, len(forces)):
             forces[i] = forces[i - 1] + share[i][:, None] * (forces[i] - forces[i - 1])
         return forces * self.strength[:, None]
+
+
+def _impulses(ends: np.ndarray, commands: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(n + 1, B, k) impulses up to the times `at` (n + 1, B) of commands (n, k), each from one of the ends to the next.
+
+    Held commands make an impulse with kinks, and a likelihood with kinks in the delay, at which a search would stop. So it is
+    a cubic spline, which is exact at the ends. A force depends on no later command, because a controller has answered later
+    readings with these. So in the last step before its end, and after it, row i of the result extrapolates from the commands
+    before.
+    """
+    dt = np.diff(ends)
+    total = np.concatenate([np.zeros((1, commands.shape[1])), np.cumsum(commands * dt[:, None], axis=0)])
+    rate = np.concatenate([commands[:1], (commands[1:] + commands[:-1]) / 2, commands[-1:]])
+    newest = np.concatenate([commands[:1], commands[:1], commands[1:] + (commands[1:] - commands[:-1]) / 2])
+    rows = np.arange(len(ends))[:, None]
+    first = np.clip(np.searchsorted(ends, at, side="right") - 1, 0, np.maximum(rows - 1, 0))
+    later = np.minimum(first + 1, len(ends) - 1)
+    step = dt[np.minimum(first, len(dt) - 1)][..., None]
+    s = np.clip((at - ends[first])[..., None] / step, 0.0, 1.0)
+    end_rate = np.where((later >= rows)[..., None], newest[np.broadcast_to(rows, at.shape)], rate[later])
+    inside = (
+        (1 + 2 * s) * (1 - s) ** 2 * total[first]
+        + s**2 * (3 - 2 * s) * total[later]
+        + step * s * (1 - s) * ((1 - s) * rate[first] - s * end_rate)
+    )
+    early = np.minimum(at - ends[0], 0.0)[..., None] * commands[0]  # the first command is taken for those before
+    return inside + early + np.maximum(at - ends[later], 0.0)[..., None] * end_rate
 
 
 class Innovations(NamedTuple):
@@ -191,7 +219,9 @@ class Innovations(NamedTuple):
             factors: (B, m + k) on the readings and the commands; default, 1.
         """
         n, lane_count, m = len(readings.t), len(lanes.delay), len(readings.names)
-        step, size = _step(robot.kind, readings.names, readings.delays or (0.0,) * m, robot.substeps(readings.dt))
+        delays, windows = readings.delays or (0.0,) * m, readings.windows or (0.0,) * m
+        times = tuple(zip(delays, windows, strict=True))
+        step, size = _step(robot.kind, readings.names, times, robot.substeps(readings.dt))
         packed = size + size * (size + 1) // 2
         calls = -(-lane_count // LANES)
         count = calls * LANES
@@ -277,7 +307,9 @@ def _expected_readings(robot: Any, names: tuple[str, ...], x: tuple[Any, ...], u
 
 
 @lru_cache(maxsize=8)
-def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substeps: int) -> tuple[casadi.Function, int]:
+def _step(
+    kind: Kind, names: tuple[str, ...], times: tuple[tuple[float, float], ...], substeps: int
+) -> tuple[casadi.Function, int]:
     """A step of `LANES` filters, and the size of their state.
 
     (state and packed covariance before the readings; constants; readings, forces before and after, the variance of the
@@ -293,11 +325,11 @@ def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substep
     y, used, before, u, uncertain, dt = _split(step, m, m, actions, actions, actions, 1)
     model = Kind(robot, (*kind.numbers, *robot.SENSORS)).model(numbers)
     rates, x = _rates_with_angles(model, names), held[:size]
-    backwards = casadi.vertcat(*rates(_tuple(x), before))
-    earlier = {delay: _expected_readings(model, names, _tuple(x - delay * backwards), before) for delay in set(delays)}
-    expected = casadi.vertcat(*[earlier[delay][i] for i, delay in enumerate(delays)])
+    read_at = cache(lambda ago: _expected_readings(model, names, _tuple(_ago(rates, x, before, ago)), before))
+    expected = casadi.vertcat(*[read_at(delay)[i] for i, (delay, _) in enumerate(times)])
+    means = casadi.vertcat(*[_mean(read_at, i, *each) for i, each in enumerate(times)])
     z, p, missed, expected_variance = _corrected(
-        x, _unpacked(held[size:], size), (expected, casadi.jacobian(expected, x)), (y, used, bias, variance)
+        x, _unpacked(held[size:], size), (means, casadi.jacobian(expected, x)), (y, used, bias, variance)
     )
     at = symbol("x, u", size + actions)
     slopes = casadi.jacobian(casadi.vertcat(*rates(_tuple(at[:size]), _tuple(at[size:]))), at)
@@ -315,6 +347,22 @@ def _step(kind: Kind, names: tuple[str, ...], delays: tuple[float, ...], substep
     )
     flags = LONG if function.n_instructions() > _MANY else SIMD
     return in_lanes("identify", (function,), flags)[0], size
+
+
+def _ago(rates: Callable[[Any, Any], tuple[Any, ...]], x: Any, u: tuple[Any, ...], ago: float) -> Any:
+    """The state that was before x (n,) by `ago`, s, by the midpoint rule; u held."""
+    if ago == 0:
+        return x
+    middle = x - ago / 2 * casadi.vertcat(*rates(_tuple(x), u))
+    return x - ago * casadi.vertcat(*rates(_tuple(middle), u))
+
+
+def _mean(read_at: Callable[[float], list[Any]], i: int, delay: float, window: float) -> Any:
+    """Reading i as a mean over a window, s, about an earlier time, by Simpson's rule."""
+    if window == 0:
+        return read_at(delay)[i]
+    first, last = read_at(delay + window / 2)[i], read_at(max(delay - window / 2, 0.0))[i]
+    return (first + 4 * read_at(delay)[i] + last) / 6
 
 
 def _corrected(

@@ -157,10 +157,12 @@ def record(
 def _readings(robot: Ballbot, task: Task, logger: _Logger) -> Readings:
     seen, commands = np.array(logger.seen), np.array(logger.commands)
     t = np.arange(len(seen)) * task.control_dt
-    names, delays = _STATES, ()
+    names, delays, windows = _STATES, (), ()
     if robot.SENSORS:
         names = tuple(name for name in Readings.readable(robot) if name.startswith(("gyro", "accel", "wheel_angle")))
         seen = seen[:, :9] * Sensors.SCALE
         seen[:, 6:] = np.cumsum(seen[:, 6:], axis=0)
-        delays = (task.control_dt / 2,) * 6 + (0.0,) * 3  # gyroscope and accelerometer show means over a step
-    return Readings(names, t, seen, np.clip(commands, -robot.force_limit, robot.force_limit), delays)
+        # gyroscope and accelerometer show means over a step
+        delays, windows = ((share * task.control_dt,) * 6 + (0.0,) * 3 for share in (0.5, 1.0))
+    commands = commands.clip(-robot.force_limit, robot.force_limit)
+    return Readings(names, t, seen, commands, delays, windows=windows)
