@@ -34,6 +34,10 @@ MISSING = [  # in an order in which nothing imports what is missing later
         *("ray", "ray"),
     ),
     ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
+    (
+        "from pathlib import Path; from ballbot_baselines.identification.formats import _bag; _bag(Path('drive'), {})",
+        *("rosbags", "logs"),
+    ),
 ]
 
 

@@ -15,24 +15,27 @@ unit = "deg"
 sign = -1                # 1 by default
 scale = 1.0              # of raw values, 1 by default
 delay = 0.005            # s, by which the reading is older than its time
+window = 0.01            # s, over which it is a mean about that earlier time
 
 [columns.pwm]
 quantity = "command_1"   # see `Readings.commanded`
-unit = "pwm"             # with full: the value at full torque; "A" with torque_constant, N·m/A; "N m"; "N"
-full = 255
+unit = "pwm"             # or "N m", "N", or "A" with torque_constant, N·m/A
+full = 255               # the value at the full force of the drive, which every "pwm" needs
 ```
+
+A ROS bag has `stamps = "received"` where its headers are of another clock, and every column has `topic` and `field`. The
+columns of a log with `format = "kugle"` have the names of `formats`.
 
 Whatever is wrong with a log is named in `Log.findings`, and readings that are wrong are left out.
 """
 
-import csv
-import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ballbot_baselines.identification.formats import LogError, _bag, _kugle, _parquet, _Source, _text
 from ballbot_baselines.identification.likelihood import Readings
 from ballbot_gym import files
 from ballbot_gym.robot import Ballbot
@@ -51,7 +54,10 @@ _UNITS = {
     "m/s²": {"m/s²": 1.0, "m/s^2": 1.0, "g": 9.80665},
 }
 _COMMAND_UNITS = ("N", "N m", "A", "pwm")
-_FIELDS = {"quantity", "unit", "sign", "scale", "delay", "full", "torque_constant"}
+_FIELDS = {"quantity", "unit", "sign", "scale", "delay", "window", "full", "torque_constant", "topic", "field"}
+_ENTRIES = ("columns", "separator", "names", "rate", "format", "stamps")
+_OF_TABLES = ("separator", "names", "rate", "format")
+_FORMATS, _STAMPS = ("table", "kugle"), ("header", "received")
 _LEAST_SECONDS = 5.0
 _LEAST_SHARE = 0.5  # of a column that must be readings
 _GAP = 3.0  # times between readings, in median ones
@@ -60,10 +66,6 @@ _FAR, _FAR_HERE = 10.0, 8.0  # typical errors of the whole log, and of those nea
 _NEARBY = 101  # readings
 _GLITCH_ROUNDS = 20
 _EXAMPLES = 3
-
-
-class LogError(files.FileError):
-    """A log that cannot be used; the message names the file, and the column where there is one."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,9 @@ class _Column:
     factor: float
     """From the values in the file to SI units, or to a robot's action."""
     delay: float = 0.0
+    window: float = 0.0
+    topic: str = ""
+    field: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,13 @@ class _Description:
     separator: str = ","
     names: tuple[str, ...] = ()
     rate: float | None = None
+    format: str = "table"
+    received: bool = False
+
+    @property
+    def is_bag(self) -> bool:
+        """Whether the columns are of a ROS bag."""
+        return bool(self.columns[0].topic)
 
     @property
     def by_quantity(self) -> dict[str, _Column]:
@@ -102,10 +114,10 @@ class _Description:
             content = tomllib.loads(files.read(path).decode())
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise LogError(f"{path} is not valid TOML: {error}") from None
-        if unknown := set(content) - {"columns", "separator", "names", "rate"}:
-            raise LogError(f"{path}: unknown entry {min(unknown)!r}; known: 'columns', 'separator', 'names', 'rate'")
+        if unknown := set(content) - set(_ENTRIES):
+            raise LogError(f"{path}: unknown entry {min(unknown)!r}; known: {', '.join(map(repr, _ENTRIES))}")
         given = content.get("columns")
-        if not isinstance(given, dict) or not all(isinstance(each, dict) for each in given.values()):
+        if not (isinstance(given, dict) and given and all(isinstance(each, dict) for each in given.values())):
             raise LogError(f"{path} has no table [columns.NAME] for each column")
         columns = tuple(_column(f"{path}: column {name!r}", name, each, robot) for name, each in given.items())
         names = [column.quantity for column in columns]
@@ -120,17 +132,9 @@ class _Description:
             raise LogError(
                 f"{path}: no column is a reading; give at least one of {', '.join(Readings.readable(robot))}"
             )
-        rate = content.get("rate")
-        if ("time" in names) == (rate is not None):
-            raise LogError(f"{path}: give either a column with quantity = 'time', or rate, in Hz")
-        if rate is not None and not (isinstance(rate, int | float) and 1 <= rate <= 1e5):
-            raise LogError(f"{path}: rate must be a number of Hz, not {rate!r}")
-        separator, header = content.get("separator", ","), content.get("names", ())
-        if not (isinstance(separator, str) and len(separator) == 1):
-            raise LogError(f"{path}: separator must be one character, not {separator!r}")
-        if not all(isinstance(name, str) for name in header):
-            raise LogError(f"{path}: names must be a list of names, not {header!r}")
-        return cls(columns, separator, tuple(header), None if rate is None else float(rate))
+        if len({bool(column.topic) for column in columns}) > 1:
+            raise LogError(f"{path}: give topic and field in every column, as for a ROS bag, or in none")
+        return cls(columns, *(_bag_entries if columns[0].topic else _table_entries)(path, content, names))
 
 
 @dataclass(frozen=True)
@@ -156,13 +160,16 @@ class Log:
             LogError: it cannot be used; the message says why.
         """
         description = _Description.read(columns or path.with_suffix(".toml"), robot)
-        table, findings = _table(path, description), list[str]()
+        (table, stamps), findings = _table(path, description), list[str]()
         for column in description.columns:
             if column.name not in table:
                 raise LogError(f"{path} has no column {column.name!r}; it has {', '.join(map(repr, table))}")
         values = {c.quantity: _numbers(path, c.name, table[c.name], findings) * c.factor for c in description.columns}
         count = len(next(iter(values.values())))
-        t = values.pop("time") if description.rate is None else np.arange(count) / description.rate
+        if stamps is not None:
+            t = stamps
+        else:
+            t = values.pop("time") if description.rate is None else np.arange(count) / description.rate
         kept = _rows_in_time(path, t, findings)
         t, growing, restarts = _clock(t[kept], findings)
         t, values = t[growing], {name: column[kept][growing] for name, column in values.items()}
@@ -177,24 +184,66 @@ class Log:
             _remove_glitches(of[name].name, t, column, findings)
         y = np.column_stack([values[name] for name in names])
         commands = np.column_stack([values[name] for name in Readings.commanded(robot)])
-        delays = tuple(of[name].delay for name in names)
+        delays, windows = (tuple(getattr(of[name], each) for name in names) for each in ("delay", "window"))
         guessed = np.where(np.isfinite(commands), 0.0, np.nanstd(commands, axis=0))
         commands = np.column_stack([_filled(column) for column in commands.T])
-        readings = Readings(names, t, y, commands, delays, restarts, guessed if guessed.any() else None)
+        readings = Readings(names, t, y, commands, delays, restarts, guessed if guessed.any() else None, windows)
         return cls(path, description, readings, tuple(findings))
 
     @staticmethod
-    def write(readings: Readings, path: Path) -> Path:
-        """Writes readings as CSV in SI units, with a line of names, and the TOML of its columns; returns the path."""
-        units, delays = readings.units, dict(zip(readings.names, readings.delays, strict=False))
+    def write(readings: Readings, path: Path, full: float | None = None) -> Path:
+        """Writes readings as CSV in SI units, with a line of names, and the TOML of its columns; returns the path.
+
+        Args:
+            readings: what is written.
+            path: of the CSV file.
+            full: the command of the full force of the drive, N, where it is known.
+        """
+        units = readings.units
+        ages = {
+            key: dict(zip(readings.names, getattr(readings, f"{key}s"), strict=False)) for key in ("delay", "window")
+        }
         table = np.column_stack([readings.t, readings.y, readings.commands])
         rows = [",".join(f"{value:.9g}" for value in row) for row in table.tolist()]
         lines = []
         for name, unit in ({"time": "s"} | units).items():
             lines += [f"[columns.{name}]", f'quantity = "{name}"', f'unit = "{unit}"']
-            lines += [f"delay = {delays[name]!r}", ""] if delays.get(name) else [""]
+            lines += [f"{key} = {age[name]!r}" for key, age in ages.items() if age.get(name)]
+            lines += [f"full = {full!r}"] if full and name.startswith("command") else []
+            lines += [""]
         files.write(path.with_suffix(".toml"), "\n".join(lines))
         return files.write(path, "\n".join([",".join(["time", *units]), *rows]) + "\n")
+
+
+def _table_entries(path: Path, content: dict[str, Any], names: list[str]) -> tuple[Any, ...]:
+    """separator, names, rate and format of a table whose columns hold quantities of these names."""
+    if "stamps" in content:
+        raise LogError(f"{path}: stamps is for ROS bags, whose columns have topic and field")
+    rate = content.get("rate")
+    if ("time" in names) == (rate is not None):
+        raise LogError(f"{path}: give either a column with quantity = 'time', or rate, in Hz")
+    if rate is not None and not (isinstance(rate, int | float) and 1 <= rate <= 1e5):
+        raise LogError(f"{path}: rate must be a number of Hz, not {rate!r}")
+    separator, header, kind = content.get("separator", ","), content.get("names", ()), content.get("format", "table")
+    if not (isinstance(separator, str) and len(separator) == 1):
+        raise LogError(f"{path}: separator must be one character, not {separator!r}")
+    if not all(isinstance(name, str) for name in header):
+        raise LogError(f"{path}: names must be a list of names, not {header!r}")
+    if kind not in _FORMATS:
+        raise LogError(f"{path}: format must be one of {', '.join(map(repr, _FORMATS))}, not {kind!r}")
+    return separator, tuple(header), None if rate is None else float(rate), kind
+
+
+def _bag_entries(path: Path, content: dict[str, Any], names: list[str]) -> tuple[Any, ...]:
+    """The same of a ROS bag, and whether its messages are of the time at which they were recorded."""
+    if wrong := [key for key in _OF_TABLES if key in content]:
+        raise LogError(f"{path}: {wrong[0]} is for tables; the columns here have topic and field, as for a ROS bag")
+    if "time" in names:
+        raise LogError(f"{path}: leave out the column of time; the messages of a ROS bag have their own")
+    stamps = content.get("stamps", "header")
+    if stamps not in _STAMPS:
+        raise LogError(f"{path}: stamps must be one of {', '.join(map(repr, _STAMPS))}, not {stamps!r}")
+    return ",", (), None, "table", stamps == "received"
 
 
 def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> _Column:
@@ -208,7 +257,7 @@ def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> _Co
             f"{place}: unknown quantity {quantity!r}; known: {', '.join((*own, *Readings.commanded(robot)))}"
         )
     numbers = {key: given.get(key, 1.0) for key in ("sign", "scale", "full", "torque_constant")} | {
-        "delay": given.get("delay", 0.0)
+        key: given.get(key, 0.0) for key in ("delay", "window")
     }
     for key, value in numbers.items():
         if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e9:
@@ -218,8 +267,11 @@ def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> _Co
         or numbers["scale"] <= 0
         or numbers["full"] <= 0
         or numbers["torque_constant"] <= 0
+        or numbers["window"] < 0
     ):
-        raise LogError(f"{place}: sign must be 1 or -1, and scale, full and torque_constant must be positive")
+        raise LogError(
+            f"{place}: sign must be 1 or -1, scale, full and torque_constant must be positive, and window at least 0"
+        )
     if quantity in Readings.commanded(robot):
         factor = _command_factor(place, unit, given, robot)
     else:
@@ -227,7 +279,11 @@ def _column(place: str, name: str, given: dict[str, Any], robot: Ballbot) -> _Co
         if unit not in known:
             raise LogError(f"{place}: unit of {quantity} must be one of {', '.join(map(repr, known))}, not {unit!r}")
         factor = known[unit]
-    return _Column(name, quantity, factor * numbers["sign"] * numbers["scale"], float(numbers["delay"]))
+    topic, part = (given.get(key, "") for key in ("topic", "field"))
+    if not (isinstance(topic, str) and isinstance(part, str) and bool(topic) == bool(part)):
+        raise LogError(f"{place}: topic and field must be names, and both are needed for a ROS bag")
+    factor *= numbers["sign"] * numbers["scale"]
+    return _Column(name, quantity, factor, float(numbers["delay"]), float(numbers["window"]), topic, part)
 
 
 def _command_factor(place: str, unit: Any, given: dict[str, Any], robot: Ballbot) -> float:
@@ -236,56 +292,33 @@ def _command_factor(place: str, unit: Any, given: dict[str, Any], robot: Ballbot
         raise LogError(
             f"{place}: unit of a command must be one of {', '.join(map(repr, _COMMAND_UNITS))}, not {unit!r}"
         )
-    for needs, name in (("A", "torque_constant"), ("pwm", "full")):
-        if unit == needs and name not in given:
-            raise LogError(f"{place}: commands in {unit!r} need {name}")
+    for needs, names in (("A", ("torque_constant", "full")), ("pwm", ("full",))):
+        if unit == needs and not set(names) & set(given):
+            raise LogError(f"{place}: commands in {unit!r} need {' or '.join(names)}")
+    if (
+        "full" in given
+    ):  # so that the command is right for a robot whose drive is stronger than it was thought to be, too
+        return robot.force_limit / given["full"]
     lever = robot.wheel_radius or robot.ball_radius
-    by_unit = {
-        "N": 1.0,
-        "N m": 1 / lever,
-        "A": given.get("torque_constant", 1.0) / lever,
-        "pwm": robot.force_limit / given.get("full", 1.0),
-    }
-    return by_unit[unit]
+    return {"N": 1.0, "N m": 1 / lever, "A": given.get("torque_constant", 1.0) / lever}[unit]
 
 
-def _table(path: Path, description: _Description) -> dict[str, Any]:
-    """The columns of a file by name, as text or numbers."""
+def _table(path: Path, description: _Description) -> tuple[dict[str, Any], np.ndarray | None]:
+    """The columns of a file by name, as text or numbers, and the times of their rows, s, where the file has them apart."""
+    if description.is_bag:
+        sources = {
+            column.name: _Source(column.topic, column.field, column.quantity, column.quantity.startswith("command"))
+            for column in description.columns
+        }
+        t, table = _bag(path, sources, description.received)
+        return table, t
+    if path.is_dir():
+        raise LogError(f"{path} is a folder; the columns of a ROS bag need topic and field in their description")
+    if description.format == "kugle":
+        return _kugle(path), None
     if path.suffix == ".parquet":
-        return _parquet(path)
-    try:
-        text = files.read(path).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise LogError(f"{path} is not text; give a CSV or Parquet file") from None
-    if description.separator == " ":
-        rows = [line.split() for line in text.splitlines()]
-    else:
-        rows = list(csv.reader(io.StringIO(text), delimiter=description.separator, skipinitialspace=True))
-    rows = [row for row in rows if row and not row[0].startswith("#")]
-    names = list(description.names) or [name.strip() for name in (rows.pop(0) if rows else [])]
-    if not rows:
-        raise LogError(f"{path} holds no readings")
-    if wrong := [i for i, row in enumerate(rows) if len(row) != len(names)]:
-        if len(wrong) > len(rows) / 2:
-            raise LogError(
-                f"{path}: rows have {len(rows[wrong[0]])} values for {len(names)} names; is the separator "
-                f"{description.separator!r}?"
-            )
-        rows = [row if len(row) == len(names) else [*row, *[""] * len(names)][: len(names)] for row in rows]
-    return dict(zip(names, zip(*rows, strict=True), strict=False))
-
-
-def _parquet(path: Path) -> dict[str, Any]:
-    try:
-        from pyarrow import parquet  # pyright: ignore[reportMissingImports]
-    except ModuleNotFoundError:
-        raise LogError(f"{path}: reading Parquet needs pyarrow: pip install pyarrow; or give a CSV file") from None
-    content = io.BytesIO(files.read(path))
-    try:
-        table = parquet.read_table(content)
-    except (OSError, ValueError) as error:
-        raise LogError(f"{path} is not a valid Parquet file: {error}") from None
-    return {name: table.column(name).to_numpy() for name in table.column_names}
+        return _parquet(path), None
+    return _text(path, description.separator, description.names), None
 
 
 def _numbers(path: Path, name: str, cells: Any, findings: list[str]) -> np.ndarray:
