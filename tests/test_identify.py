@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from ballbot_baselines.identification.checks import Predictions
-from ballbot_baselines.identification.estimate import Problem
+from ballbot_baselines.identification.estimate import Found, Problem
 from ballbot_baselines.identification.identify import identify
 from ballbot_baselines.identification.likelihood import Innovations, Readings
 from ballbot_baselines.identification.logs import Log, LogError
 from ballbot_baselines.identification.record import Recorded, Waves, record
+from ballbot_baselines.identification.scores import _scores
 from ballbot_gym import Randomization, named_robot
 from ballbot_gym.robot import Ballbot, read_urdf
 from ballbot_train.commands.identify import identify as command
@@ -134,6 +135,52 @@ def test_predictions_of_a_slow_log_are_of_the_next_reading_at_least(readings: Re
     np.testing.assert_array_equal(found.errors[..., 0], found.errors[..., 1])
     np.testing.assert_array_equal(found.constant[:, 0], found.constant[:, 1])
     assert (found.constant > 0).all()
+
+
+def test_the_applied_force_is_smooth_in_the_delay_and_depends_on_no_later_command(readings: Readings) -> None:
+    problem = Problem(ROBOT, readings.names)
+    i, z = [each.name for each in problem.parameters].index("delay"), np.zeros((5, len(problem.parameters)))
+    delays, step = np.array([0.0, 0.01, 0.02, 0.004, -0.002]), 1e-6
+    z[:, i] = delays / problem.parameters[i].spread
+
+    def forces(change: float, log: Readings = readings) -> np.ndarray:
+        moved = z.copy()
+        moved[:, i] += change / problem.parameters[i].spread
+        return problem.lanes(moved).applied(log)
+
+    here, count = forces(0.0), len(readings.t)
+    for k in range(3):  # delays of whole steps of 10 ms
+        np.testing.assert_allclose(here[k:, k], readings.commands[: count - k], atol=1e-6)
+    left, right = here - forces(-step), forces(step) - here
+    assert (
+        np.abs(left - right).max() < 0.01 * np.abs(left).max()
+    )  # a kink would make them differ by as much as they are
+    later = readings.commands.copy()
+    later[100:] += 50.0
+    assert np.array_equal(forces(0.0, replace(readings, commands=later))[:100], here[:100])
+
+
+def test_intervals_are_wider_where_errors_of_readings_are_correlated(recorded: Recorded) -> None:
+    log, rng = recorded.readings, np.random.default_rng(0)
+    noise = np.zeros_like(log.y)
+    for k in range(1, len(noise)):  # correlated over 0.2 s
+        noise[k] = 0.95 * noise[k - 1] + 0.003 * rng.normal(size=noise.shape[1])
+    lean, problem = log.names.index("lean_x"), Problem(ROBOT, log.names, KNOWN)
+    noise[:, [j for j in range(noise.shape[1]) if j != lean]] = 0.0
+    bias = [each.name for each in problem.parameters].index("lean_x bias")
+    white, correlated = (problem.most_likely([replace(log, y=log.y + share * noise)]) for share in (0.0, 1.0))
+    assert correlated.widening[bias] > 1.5 * white.widening[bias]
+
+
+def test_the_command_of_a_log_is_a_share_of_the_full_force_also_for_the_robot_that_made_it(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    path = Log.write(recorded.readings, tmp_path / "log.csv", ROBOT.force_limit)
+    nominal, true = (Log.read(path, robot).readings.commands for robot in (ROBOT, recorded.robot))
+    assert recorded.strength == pytest.approx(0.9)
+    same = np.isclose(nominal, recorded.readings.commands, rtol=1e-6, atol=1e-6)
+    assert same.mean() > 0.99  # the others are taken for glitches
+    np.testing.assert_allclose(true, 0.9 * nominal, rtol=1e-6, atol=1e-6)
 
 
 def test_glitches_are_named_and_left_out(readings: Readings, tmp_path: Path) -> None:
@@ -392,3 +439,19 @@ def test_a_designed_motion_is_more_informative_than_balancing_within_its_limit_o
         problem.information([each.readings], np.zeros(len(problem.parameters)))[2][i, i] for each in (moved, still_made)
     )
     assert moving > 16 * balancing  # a quarter of the deviation
+
+
+def test_the_regret_of_the_controller_is_told_by_parts_of_a_log_that_end_at_rest() -> None:
+    def motion(t: float) -> np.ndarray:
+        return np.array([0.6, 0.0, 0.0]) * (t >= 2.0)
+
+    made = record(ROBOT, 9.0, motion, None, "rk4")
+    problem = Problem(ROBOT, made.readings.names, KNOWN)
+    z = np.zeros(len(problem.parameters))
+    found = Found(problem, z, np.eye(len(z)), 0)
+    (score,) = _scores(found, made.readings)
+    assert 1.9 < score.begin < 2.1  # when the robot begins to move
+    assert score.begin + score.duration == pytest.approx(9.0, abs=0.05)  # it stays at rest until the log ends
+    assert abs(score.regret) < 0.005  # LQR is the optimum of small motions; the filter's states are not exact
+    driven = record(ROBOT, 6.0, None, None, "rk4")
+    assert _scores(found, driven.readings) == []

@@ -8,6 +8,7 @@ import numpy as np
 from ballbot_baselines.identification.checks import Predictions, Suspect
 from ballbot_baselines.identification.estimate import Found, Problem
 from ballbot_baselines.identification.logs import Log, LogError
+from ballbot_baselines.identification.scores import _Score, _scores
 from ballbot_gym.robot import Ballbot
 
 _HELD_BACK = 0.25  # the last part of every log
@@ -30,6 +31,15 @@ class Identified:
     predictions: Predictions
     findings: tuple[str, ...]
 
+    def scores(self, log: Log) -> list[_Score]:
+        """The regret of the controller that made a log, in those of its parts that are episodes of Stabilize.
+
+        Returns:
+            begin, s, duration, s, cost, optimum and regret of each, at most 3; none if the log has no part that begins away
+            from rest and ends at rest, so that its controller cannot be scored.
+        """
+        return _scores(self.found, log.readings)
+
 
 def identify(
     robot: Ballbot, logs: list[Log], known: tuple[str, ...] = (), watch: Callable[[int], object] = lambda done: None
@@ -48,7 +58,8 @@ def identify(
     """
     first = logs[0].readings
     for log in logs:
-        if (log.readings.names, log.readings.delays) != (first.names, first.delays):
+        same = (getattr(log.readings, each) == getattr(first, each) for each in ("names", "delays", "windows"))
+        if not all(same):
             raise ValueError(f"{log.path} has other readings than {logs[0].path}; identify them one by one")
     problem = Problem(robot, first.names, known)
     for log in logs:

@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ballbot_baselines.identification.identify import Identified
 from ballbot_baselines.identification.identify import identify as identified
 from ballbot_baselines.identification.likelihood import Innovations, Readings
 from ballbot_baselines.identification.logs import Log, LogError
-from ballbot_baselines.identification.record import Waves
+from ballbot_baselines.identification.record import Motion, Waves
 from ballbot_baselines.identification.record import record as recorded
 from ballbot_gym import files
 from ballbot_gym.lazy import imports_of
@@ -54,13 +54,14 @@ def identify(
     """Finds the numbers of a robot from logs of its motion, with 95 % intervals, and writes its URDF.
 
     Args:
-        logs: CSV or Parquet files with the same columns.
+        logs: CSV or Parquet files, dumps of Kugle or ROS bags, with the same columns.
         robot: name of the nominal robot, or its URDF: what is known before, from drawings and data sheets.
         columns: the TOML file that says what the columns are; default, next to the first log, with its name.
         known: names of numbers that were measured otherwise and are held at those of the robot, such as body_mass.
         record: record a log of a simulated robot instead.
         design: find the most informative motion instead.
-        motion: of --record: the motion.json that --design wrote; default, the robot drives in waves.
+        motion: of --record: the motion.json that --design wrote, or a file of "times" (k), s, and "places" (k, 3), x and
+            y in m and the heading in rad, to which the robot moves at these; default, the robot drives in waves.
         seconds: of --record and --design: length of the log, s; default, 60 and 20.
         max_lean: of --design: the greatest lean, degrees.
         physics: of --record: "bullet", "mujoco" or "rk4"; default, the first that is installed.
@@ -88,7 +89,7 @@ def identify(
         bar = progress.add_task("likelihood", total=None)
         result = identified(nominal, read, known, lambda done: progress.update(bar, completed=done))
     _show(result)
-    _write(result, read[0].readings, robot, [str(path) for path in logs], out)
+    _write(result, read, robot, _show_scores(result, read), out)
 
 
 def _refuse(wrong: bool, message: str) -> None:
@@ -111,7 +112,7 @@ def _record(
     track = track or ("unknown" if nominal.SENSORS else "real")
     waves = None if motion is None else _motion(motion)
     log = recorded(nominal, seconds, waves, track, physics_or_default(physics, name), seed)
-    path = Log.write(log.readings, out / "log.csv")
+    path = Log.write(log.readings, out / "log.csv", nominal.force_limit)
     true = files.write(out / "true.urdf", urdf_text(log.robot))
     console.print(f"log: {path}, {seconds:g} s\ncolumns: {out / 'log.toml'}")
     console.print(f"the robot that made it, with a delay of {1e3 * log.delay:g} ms: {true}")
@@ -137,16 +138,31 @@ def _design(nominal: Ballbot, seconds: float, max_lean: float, known: tuple[str,
     console.print(f"motion: {path}, with leans of up to {math.degrees(found.lean):.1f}°")
 
 
-def _motion(path: Path) -> Waves:
-    """The motion of a file that --design wrote."""
+class _Places(NamedTuple):
+    """A motion from place to place."""
+
+    times: np.ndarray
+    """(k,) s, growing, at which the robot is asked to be elsewhere."""
+    places: np.ndarray
+    """(k, 3) m, m and rad; before the first time it is the origin."""
+
+    def __call__(self, t: float) -> np.ndarray:
+        i = int(np.searchsorted(self.times, t, side="right")) - 1
+        return self.places[i] if i >= 0 else np.zeros(3)
+
+
+def _motion(path: Path) -> Motion:
+    """The motion of a file that --design wrote, or one from place to place."""
     held = files.read_json(path)
+    kind = _Places if "places" in held else Waves
     try:
-        parts = [files.numbers(held[name], f"{path}: {name}") for name in Waves._fields]
+        parts = [files.numbers(held[name], f"{path}: {name}") for name in kind._fields]
     except KeyError as error:
         raise LogError(f"{path} has no {error.args[0]!r}; give a motion that --design wrote") from None
-    k = len(parts[1])
-    _refuse([part.shape for part in parts] != [(3, k), (k,), (3, k)], f"{path} is no motion that --design wrote")
-    return Waves(*parts)
+    k = parts[0].size if kind is _Places else len(parts[1])
+    shapes = [(k,), (k, 3)] if kind is _Places else [(3, k), (k,), (3, k)]
+    _refuse([part.shape for part in parts] != shapes, f"{path} is no motion that --design wrote")
+    return kind(*parts)
 
 
 def _show(result: Identified) -> None:
@@ -179,6 +195,25 @@ def _show(result: Identified) -> None:
     print_table("predictions of the last quarter, which was held back", header, rows)
 
 
+def _show_scores(result: Identified, logs: list[Log]) -> list[dict[str, Any]]:
+    """Prints and returns the regret of the controller that made the logs, where they tell it."""
+    rows: list[dict[str, Any]] = []
+    for log in logs:
+        for each in result.scores(log):
+            rows.append({"log": str(log.path), **each._asdict(), "regret": each.regret})
+            console.print(
+                f"regret of the controller of {log.path}, in {each.duration:.3g} s from {each.begin:.3f} s on that end at "
+                f"rest: {each.regret:.1%} (cost {each.cost:.4g}, optimum {each.optimum:.4g})",
+                soft_wrap=True,
+            )
+    if not rows:
+        console.print(
+            "the regret of the controller is not known: no part of the log begins away from rest and ends at rest",
+            soft_wrap=True,
+        )
+    return rows
+
+
 def _rows(result: Identified) -> list[list[str]]:
     return [
         [
@@ -193,7 +228,7 @@ def _rows(result: Identified) -> list[list[str]]:
     ]
 
 
-def _write(result: Identified, readings: Readings, robot: str, logs: list[str], out: Path) -> None:
+def _write(result: Identified, logs: list[Log], robot: str, scores: list[dict[str, Any]], out: Path) -> None:
     """Writes the robot, its numbers as CSV and JSON, and the figure of residuals."""
     found = result.found
     rows: list[dict[str, Any]] = [
@@ -211,7 +246,7 @@ def _write(result: Identified, readings: Readings, robot: str, logs: list[str], 
     shown = result.predictions
     record = {
         "robot": robot,
-        "logs": logs,
+        "logs": [str(log.path) for log in logs],
         "known": found.problem.known,
         "numbers": rows,
         "findings": result.findings,
@@ -222,10 +257,11 @@ def _write(result: Identified, readings: Readings, robot: str, logs: list[str], 
             **dict(zip(("nominal", "identified"), shown.errors.tolist(), strict=True)),
             "no_change": shown.constant.tolist(),
         },
+        "controller": scores,
     }
     files.write_csv(out / "numbers.csv", rows)
     files.write(out / "numbers.json", json.dumps(record, indent=1, ensure_ascii=False))
-    figures.save(_residual_figure(result, readings), out / "residuals.png")
+    figures.save(_residual_figure(result, logs[0].readings), out / "residuals.png")
     path = files.write(out / "robot.urdf", urdf_text(found.robot))
     console.print(f"numbers: {out / 'numbers.csv'}\nresiduals: {out / 'residuals.png'}\nrobot: {path}")
 
