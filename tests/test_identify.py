@@ -441,7 +441,7 @@ def test_a_designed_motion_is_more_informative_than_balancing_within_its_limit_o
     assert moving > 16 * balancing  # a quarter of the deviation
 
 
-def test_the_regret_of_the_controller_is_told_by_parts_of_a_log_that_end_at_rest() -> None:
+def test_the_regret_of_the_controller_is_that_of_parts_of_a_log_that_end_at_rest() -> None:
     def motion(t: float) -> np.ndarray:
         return np.array([0.6, 0.0, 0.0]) * (t >= 2.0)
 
