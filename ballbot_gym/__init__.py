@@ -14,6 +14,7 @@ from ballbot_gym.registry import load_plugins, register_task
 from ballbot_gym.robot import (
     Ballbot,
     Cylinder,
+    GeneralOmni,
     Omni,
     PointBall,
     Quantity,
@@ -53,6 +54,7 @@ __all__ = [
     "Controller",
     "Cylinder",
     "Episode",
+    "GeneralOmni",
     "Marker",
     "Omni",
     "Orbit",

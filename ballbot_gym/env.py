@@ -141,7 +141,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
     | grip | (4,) f_x, f_y, N of the floor on the ball when the step began, and the friction it needs (0 after `reset`) |
-    | drawn | (6,) or (14,) parameters that a randomization drew for the episode; names in `Randomization.DRAWN` |
+    | drawn | (6,), (14,) or (20,) numbers that a randomization drew for the episode, see `Randomization.DRAWN` |
 
     Only envs with a randomization have `drawn`, and only robots whose friction is limited have `grip`. Such a robot has lost
     its grip if, at the beginning or at the end of a step, its motion needs more friction than there is, or a floor that

@@ -43,7 +43,7 @@ def starts(
         drawn: tuple[float, ...] = ()
         if randomization.moves_optima:
             rng = np.random.default_rng([zlib.crc32(task.id.encode()), index, draw, 1])
-            drawn = randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt)
+            drawn = randomization.draw(tuple(rng.random(randomization.most_draws).tolist()), task.control_dt)
         yield *episode(task, params, index, draw), drawn
 
 

@@ -124,9 +124,7 @@ class _BulletSimulator(Simulator):
                 robot.inertia,
                 robot.inertia,
                 robot.axial_inertia,
-                0.0,
-                0.0,
-                robot.com_height,
+                *robot.centre_of_mass,
             ),
         }
         for link, numbers in wanted.items():

@@ -102,7 +102,7 @@ class _MujocoSimulator(Simulator):
         robot = self._params
         body = ball.add_body(
             name="body",
-            ipos=(0, 0, robot.com_height),
+            ipos=robot.centre_of_mass,
             **_inertial(robot.body_mass, robot.inertia, robot.inertia, robot.axial_inertia),
         )
         for axis, name in _LEANS:
@@ -213,6 +213,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         super().reset(x, memory)
         if not memory:
             self._positions[5], self._velocities[5], self._velocities[8] = x[8:]
+        self._speeds: np.ndarray | None = None
         self._brake()
 
     def step(self, u: tuple[float, ...]) -> State:
@@ -244,6 +245,16 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         self._mujoco.mju_quat2Mat(turn, self._positions[6:])
         spin = float(turn[6:] @ self._velocities[6:])
         self._model.actuator_biasprm[3, 2] = wheels.floor_torque(spin) / spin if spin else 0.0
+        if self._rubs:
+            self._mujoco.mj_fwdPosition(self._model, self._data)  # else speeds are those before the last step
+            self._mujoco.mj_fwdVelocity(self._model, self._data)
+            speeds = self._data.actuator_velocity[:3].copy()
+            before, self._speeds = speeds if self._speeds is None else self._speeds, speeds
+            for i, speed in enumerate(
+                (speeds + (speeds - before) / 2).tolist()
+            ):  # about that of the next step's middle
+                drag = wheels.drag(self._params.force_limit) + self._params.axle_drag(speed)
+                self._model.actuator_biasprm[i, 2] = -drag
         return spin
 
     def _twist(self, torque: np.ndarray) -> None:
@@ -259,8 +270,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         # of the ball relative to the body, as seen from the body
         (a, b, c), (p, q, r) = spins[_BODY].tolist(), spins[_BALL].tolist()
         relative = accelerations[_BALL] - accelerations[_BODY] - (b * r - c * q, c * p - a * r, a * q - b * p)
-        axis = data.xmat[_BODY].reshape(3, 3)[:, 2]
-        return self._params.rotor_torque(relative, axis)
+        return self._params.rotor_torque(relative, data.xmat[_BODY].reshape(3, 3))
 
     def _describe(self, spec: Any) -> None:
         super()._describe(spec)
@@ -269,7 +279,7 @@ class _MujocoOmniSimulator(_MujocoContactSimulator):
         body.add_joint(name="psi", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
         for name, place in (("body", body), ("ball", ball), ("floor", spec.worldbody)):
             place.add_site(name=f"on_{name}")
-        drag = wheels.drag(robot.force_limit)
+        drag, self._rubs = wheels.drag(robot.force_limit), robot.axle_drag(0.0) > 0
         units = [robot.torque(tuple(unit)) for unit in np.eye(3).tolist()]
         for turning, damping, other in (*((unit, drag, "body") for unit in units), ((0, 0, 1), 0, "floor")):
             spec.add_actuator(

@@ -7,6 +7,7 @@ from ballbot_gym.robot.ballbot import (
     tilt,
 )
 from ballbot_gym.robot.base import RK4_STEP, Kind, Quantity, Robot
+from ballbot_gym.robot.general_omni import GeneralOmni
 from ballbot_gym.robot.omni import Omni, Wheels
 from ballbot_gym.robot.point_ball import PointBall
 from ballbot_gym.robot.randomization import (
@@ -57,6 +58,7 @@ __all__ = [
     "URDF_PATH",
     "Ballbot",
     "Cylinder",
+    "GeneralOmni",
     "Kind",
     "Omni",
     "PointBall",

@@ -121,6 +121,11 @@ class Ballbot(_Derived, Robot):
         return 0.0
 
     @property
+    def centre_of_mass(self) -> tuple[Any, Any, Any]:
+        """Of the body, in its own frame with the ball's centre as origin, m."""
+        return 0.0, 0.0, self.com_height
+
+    @property
     def weight(self) -> Any:
         """Of ball and body, N."""
         return self.total_mass * self.gravity

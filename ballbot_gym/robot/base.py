@@ -174,6 +174,17 @@ class Robot(ABC):
                 raise ValueError(f"{type(self).__name__} has no {name} that a randomization could vary")
         return replace(self, **{name: getattr(self, name) * factor for name, factor in factors.items()})  # pyright: ignore
 
+    def displaced(self: Own, *errors: Any) -> Own:
+        """The same robot with errors, m and rad, of where its centre of mass and its wheels are.
+
+        Raises:
+            ValueError: these are no numbers of this kind of robot.
+        """
+        raise ValueError(
+            f"a {type(self).__name__} has no numbers for com_offset and wheel_error; leave them out, or give a GeneralOmni, "
+            "for example GeneralOmni.of(named_robot('omni'))"
+        )
+
     def on_floor(self: Own, friction: float) -> Own:
         """The same robot on a floor with this coefficient of friction.
 

@@ -229,6 +229,10 @@ class Omni(RollingBall):
         parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
         return ops.stack(tuple(parts), like=force)
 
+    def axle_drag(self, speed: Any) -> Any:
+        """N·s/m, by which dry friction in an axle slows a wheel whose surface moves at a speed, m/s; there is none."""
+        return 0.0
+
     def torque(self, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
         """Σ a_i u_i, N·m, of the wheels' forces u (..., 3), N, in the body's frame.
 
@@ -254,23 +258,21 @@ class Omni(RollingBall):
         own = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
         w = tuple(_dot(axis, turning) - body for axis, body in zip(axes, own, strict=True))
         faster = self.accelerations(x, u)
-        rotors = self.ball_radius**2 * self.wheels.mass
-        felt = [
-            pull - share * rotors * _dot(row, faster)
-            for pull, share, row in zip(
-                self._pulls(x, u, w),
-                (ACROSS, ACROSS, ALONG),
-                zip(*self.relative_turning(x)[1], strict=True),
-                strict=True,
-            )
-        ]
+        turned = tuple(_dot(row, faster) for row in zip(*self.relative_turning(x)[1], strict=True))
+        felt = [pull - own for pull, own in zip(self._pulls(x, u, w), self._rotors_of(x, turned), strict=True)]
         return tuple(_dot(column, felt) for column in zip(*axes, strict=True))
 
-    def rotor_torque(self, turning: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    def _rotors_of(self, x: Vector, turned: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+        """m Σ a_i (a_i · ẇ), N·m, in frame B, of a turning relative to the body that changes by `turned`, rad/s²."""
+        rotors = self.ball_radius**2 * self.wheels.mass
+        return tuple([share * rotors * each for share, each in zip((ACROSS, ACROSS, ALONG), turned, strict=True)])
+
+    def rotor_torque(self, turning: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """(3,) N·m, of the rotors on a ball whose turning relative to the body changes by `turning` (3,), rad/s².
 
-        Both that and the body's axis, a unit vector (3,), are in one frame.
+        Both that and the body's axes, the columns of `frame` (3, 3), are in one frame.
         """
+        axis = frame[:, 2]
         felt = ACROSS * turning + (ALONG - ACROSS) * (axis @ turning) * axis
         return -self.wheels.mass * self.ball_radius**2 * felt
 
@@ -348,9 +350,7 @@ class Omni(RollingBall):
         _, _, gamma, theta, *_ = ops.components(x)
         sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
         mass, h, inertia, axial = self.moving_mass, self.first_moment, self.pivot_inertia, self.axial_inertia
-        rotors = self.wheels.mass * self.ball_radius**2
-        weighted = [(ACROSS * rotors * a, ACROSS * rotors * b, ALONG * rotors * c) for a, b, c in columns]
-        m = [[_dot(a, b) if i <= j else 0.0 for j, b in enumerate(columns)] for i, a in enumerate(weighted)]
+        m = self._rotor_matrix(x, columns)
         lean_inertia = inertia * cos_t * cos_t + axial * sin_t * sin_t
         own = {
             (0, 0): mass, (0, 2): h * cos_g * cos_t, (0, 3): -h * sin_g * sin_t, (1, 1): mass, (1, 3): h * cos_t,
@@ -360,24 +360,35 @@ class Omni(RollingBall):
             m[i][j] = m[i][j] + value
         return [[m[min(i, j)][max(i, j)] for j in range(6)] for i in range(6)]
 
+    def _rotor_matrix(self, x: Vector, columns: tuple[tuple[Any, ...], ...]) -> list[list[Any]]:
+        """The rotors' part of the upper triangle of M (6, 6), with J by columns."""
+        rotors = self.wheels.mass * self.ball_radius**2
+        weighted = [(ACROSS * rotors * a, ACROSS * rotors * b, ALONG * rotors * c) for a, b, c in columns]
+        return [[_dot(a, b) if i <= j else 0.0 for j, b in enumerate(columns)] for i, a in enumerate(weighted)]
+
     def _pulls(self, x: Vector, u: Vector, w: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
         """Σ a_i f_i, N·m, of a ball that turns at w, rad/s, in frame B, less what the rotors take of it for J v̇."""
-        *_, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, _ = ops.components(x)
-        sin_t, cos_t = ops.sin(theta), ops.cos(theta)
         r, wheels, (w1, w2, w3) = self.ball_radius, self.wheels, w
-        # ẇ without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body
-        rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
-        b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
-        bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
-        bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
-        bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
-        t1, t2, t3 = self.torque(u, psi)
+        bias1, bias2, bias3 = self._turning_bias(x, w)
+        t1, t2, t3 = self.torque(u, ops.components(x)[8])
         drag, rotors = r * r * wheels.drag(self.force_limit), r * r * wheels.mass
         return (
             t1 - ACROSS * (drag * w1 + rotors * bias1),
             t2 - ACROSS * (drag * w2 + rotors * bias2),
             t3 - ALONG * (drag * w3 + rotors * bias3),
         )
+
+    @staticmethod
+    def _turning_bias(x: Vector, w: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        """ẇ, rad/s², without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body."""
+        *_, theta, _, _, gamma_dot, theta_dot, _, psi_dot, _ = ops.components(x)
+        sin_t, cos_t, (w1, w2, w3) = ops.sin(theta), ops.cos(theta), w
+        rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
+        b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
+        bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
+        bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
+        bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
+        return bias1, bias2, bias3
 
     def _wheel_speeds(self, w: tuple[Any, Any, Any]) -> tuple[Any, ...]:
         """The wheels' speeds (3), rad/s, against the body, over which the ball turns at w, rad/s, in the body's own frame."""

@@ -18,6 +18,8 @@ _LARGEST = 1e6  # of any number
 _LARGEST_FACTOR = 1e3
 _MOST_DELAY_STEPS = 1000  # every one of them is remembered, and takes time in every step
 
+_NEWER = ("com_offset", "wheel_error")  # fields that version 1.0 did not have
+
 Range = tuple[float, float]
 """(low, high), both included; drawn uniformly."""
 
@@ -67,6 +69,11 @@ class Randomization:
     """Horizontal impulse on the ball, N·s, in a random direction, spread over one control step."""
     push_interval: float = 1.0
     """Mean time between pushes, s. In each control step there is one with probability control_dt / push_interval."""
+    com_offset: float = 0.0
+    """Standard deviation of what is added to com_x and to com_y of a `GeneralOmni`, m, drawn per episode."""
+    wheel_error: float = 0.0
+    """Standard deviation of what is added to the zenith and to each azimuth of the wheels of a `GeneralOmni`, rad, drawn per
+    episode."""
 
     DRAWN = (
         "body_mass", "ball_mass", "com_height", "inertia", "gain", "delay", "force", "friction",
@@ -74,6 +81,8 @@ class Randomization:
     )  # fmt: skip
     """Names of what `draw` draws: factors, the gain and delay of `actuate`, and errors of the sensors in SI units. If none of
     the others is drawn, there are only the first 6."""
+    DISPLACED = ("com_x", "com_y", "zenith", "azimuth_1", "azimuth_2", "azimuth_3")
+    """Numbers of a `GeneralOmni` to which `draw` adds what follows, m and rad, if any of them varies."""
     PUSH_DRAWS = 3
     """Uniform numbers that `push` takes."""
     NOISE_DRAWS = 8
@@ -103,6 +112,11 @@ class Randomization:
         if self.push_interval == 0:
             raise ValueError("Randomization: push_interval must be positive, not 0")
 
+    def __repr__(self) -> str:
+        """The text that version 1.0 wrote of randomizations without newer fields, so that its files can be read."""
+        shown = [each.name for each in fields(self) if each.name not in _NEWER or getattr(self, each.name)]
+        return f"Randomization({', '.join(f'{name}={getattr(self, name)!r}' for name in shown)})"
+
     @classmethod
     def checked(cls, randomization: Any, params: Robot | None = None) -> "Randomization":
         """The randomization that was given, also by its name in `TRACKS` or as the dict of all its fields, or none for None.
@@ -117,6 +131,8 @@ class Randomization:
             if randomization not in TRACKS:
                 raise ValueError(f"unknown randomization {randomization!r}; known: {', '.join(map(repr, TRACKS))}")
             return TRACKS[randomization]
+        if isinstance(randomization, dict):  # an older version wrote it without the newer fields
+            randomization = dict.fromkeys(_NEWER, 0.0) | randomization
         randomization = from_fields(cls, randomization)
         if not isinstance(randomization, cls):
             raise TypeError(
@@ -136,7 +152,7 @@ class Randomization:
     @cached_property
     def varies_robot(self) -> bool:
         """Whether robots differ from the nominal one."""
-        return any(r != (1.0, 1.0) for r in self._factors)
+        return any(r != (1.0, 1.0) for r in self._factors) or self._displaces
 
     @cached_property
     def varies_actuator(self) -> bool:
@@ -166,8 +182,20 @@ class Randomization:
     @cached_property
     def episode_draws(self) -> int:
         """Uniform numbers that `draw` takes."""
+        if self._displaces:
+            return len(self.DRAWN) + len(self.DISPLACED)
         every = self.is_biased or self.force != (1.0, 1.0) or self.friction != (1.0, 1.0)
         return len(self.DRAWN) if every else 6
+
+    @cached_property
+    def most_draws(self) -> int:
+        """Uniform numbers of which `draw` takes all or the first."""
+        return max(len(self.DRAWN), self.episode_draws)
+
+    @cached_property
+    def _displaces(self) -> bool:
+        """Whether the centre of mass or wheels move."""
+        return self.com_offset > 0 or self.wheel_error > 0
 
     @cached_property
     def _factors(self) -> tuple[Range, ...]:
@@ -225,7 +253,9 @@ class Randomization:
             delay = ops.where(z[5] * (high - low + 1) >= k - low + 1, 0.0 * z[5] + (k + 1), delay)
         if self.episode_draws == 6:
             return (*factors, gain, delay)
-        deviations = (std for std in self._biases for _ in range(2))
+        deviations = [std for std in self._biases for _ in range(2)]
+        if self._displaces:
+            deviations += [self.com_offset] * 2 + [self.wheel_error] * 4
         errors = (std * normal for std, normal in zip(deviations, normals(z[8:]), strict=True))
         return (*factors, gain, delay, between(z[6], *self.force), between(z[7], *self.friction), *errors)
 
@@ -233,7 +263,8 @@ class Randomization:
         """The robot of an episode for which `draw` drew this."""
         names = ("body_mass", "ball_mass", "com_height", "inertia")
         force, friction = drawn[6:8] or (1.0, 1.0)
-        return params.varied(**dict(zip(names, drawn[:4], strict=True)), force=force, friction=friction)
+        robot = params.varied(**dict(zip(names, drawn[:4], strict=True)), force=force, friction=friction)
+        return robot.displaced(*drawn[len(self.DRAWN) :]) if self._displaces else robot
 
     def resting(self, none: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
         """The memory of `actuate` of an actuator at rest, whose earlier commands were `none` (2); () if it is ideal."""

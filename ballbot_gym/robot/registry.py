@@ -137,14 +137,15 @@ def robot_name(params: Robot) -> str:
 
 
 def first_of_kind(params: Robot) -> str:
-    """The name of the first robot that is registered of a robot's kind.
+    """The name of the first robot that is registered of a robot's kind, or else of the nearest kind that this one extends.
 
     Raises:
         ValueError: none is.
     """
-    for name, robot in ROBOTS.items():
-        if type(robot.params) is type(params):
-            return name
+    for kind in type(params).__mro__:
+        for name, robot in ROBOTS.items():
+            if type(robot.params) is kind:
+                return name
     raise ValueError(f"no {type(params).__name__} has a name; give it one with ballbot_gym.register_robot")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.robot.ballbot import STANDARD_GRAVITY, Ballbot
+from ballbot_gym.robot.general_omni import GeneralOmni
 from ballbot_gym.robot.omni import Omni, Wheels
 from ballbot_gym.robot.point_ball import PointBall
 from ballbot_gym.robot.rolling_ball import RollingBall
@@ -24,7 +25,12 @@ ROLLING_URDF_PATH = URDF_FOLDER / "rolling.urdf"
 OMNI_URDF_PATH = URDF_FOLDER / "omni.urdf"
 """The URDF of a robot with three omni-wheels."""
 
-_TEMPLATES = {PointBall: URDF_PATH, RollingBall: ROLLING_URDF_PATH, Omni: OMNI_URDF_PATH}
+_TEMPLATES = {
+    PointBall: URDF_PATH,
+    RollingBall: ROLLING_URDF_PATH,
+    Omni: OMNI_URDF_PATH,
+    GeneralOmni: OMNI_URDF_PATH,
+}
 _FILE_LIMIT = 16 * 2**20  # bytes
 _BALL, _BODY, _SHAPE = "link[@name='ball']/", "link[@name='body']/", "visual/geometry/"
 _PLACES: dict[str, tuple[tuple[str, str], ...]] = {
@@ -44,6 +50,9 @@ _PLACES: dict[str, tuple[tuple[str, str], ...]] = {
     "force_limit": (("joint[@name='x']/limit", "effort"), ("joint[@name='y']/limit", "effort")),
 }
 """Where a URDF has each number: element and attribute. The first place is read, and all are written."""
+_CENTRE = f"{_BODY}inertial/origin"
+_AS_BUILT = ("zenith", "azimuth_1", "azimuth_2", "azimuth_3", "axle_friction")
+"""What <wheels> may have of a robot whose wheels are not where those of the packaged robots are."""
 _FRICTION = f"{_BALL}contact/lateral_friction", "value"
 _COMPARED = {
     "joint": (
@@ -71,7 +80,9 @@ def read_urdf(path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -
 
     A joint 'roll' makes it a rolling ball's: world → x → y → z prismatic, hub; from the hub the ball on the spherical
     joint 'roll', and gamma, yoke, theta, body. So only the ball rolls, and the body does not yaw. An element <wheels>
-    adds three omni-wheels, and a frame between theta and the body, which then turns about its own axis on joint 'psi'.
+    adds three omni-wheels, and a frame between theta and the body, which then turns about its own axis on joint 'psi'. It is
+    a `GeneralOmni` if the body's centre of mass is off its axis, or if <wheels> has a zenith, an azimuth_1, azimuth_2 or
+    azimuth_3, rad, or an axle_friction, N·m.
 
     Args:
         path: the URDF; without one, the robot of the paper.
@@ -84,6 +95,13 @@ def read_urdf(path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -
     urdf = _Urdf(Path(path))
     rolls, has_wheels = (urdf.root.find(query) is not None for query in ("joint[@name='roll']", "wheels"))
     kind: type[Ballbot] = Omni if has_wheels else RollingBall if rolls else PointBall
+    off_axis, own = (0.0, 0.0), {}
+    if has_wheels:
+        off_axis = urdf.vector(_CENTRE)[:2]
+        given = urdf.element("wheels").attrib
+        own = {name: urdf.number("wheels", name) for name in _AS_BUILT if name in given}
+        if own or off_axis != (0.0, 0.0):
+            kind, own = GeneralOmni, own | dict(zip(("com_x", "com_y"), off_axis, strict=True))
     names = {field.name for field in fields(kind)}
     numbers: dict[str, Any] = {name: urdf.number(*places[0]) for name, places in _PLACES.items() if name in names}
     friction = math.inf if urdf.root.find(_FRICTION[0]) is None else urdf.number(*_FRICTION)
@@ -91,7 +109,7 @@ def read_urdf(path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -
     try:
         if has_wheels:
             numbers["wheels"] = Wheels(**wheel)
-        robot = kind(**numbers, gravity=float(gravity), friction=friction)
+        robot = kind(**numbers, **own, gravity=float(gravity), friction=friction)
     except (ValueError, OverflowError) as error:
         raise urdf.error(str(error)) from None
     urdf.check_alike(_written(robot), rolls)
@@ -110,6 +128,9 @@ def _written(robot: Ballbot) -> ElementTree.Element:
     for name, kind in robot.PARTS.items():  # an element of this name has an attribute for each number
         for field in fields(kind):
             urdf.element(name).set(field.name, repr(getattr(getattr(robot, name), field.name)))
+    if isinstance(robot, GeneralOmni):
+        for name in _AS_BUILT:
+            urdf.element("wheels").set(name, repr(getattr(robot, name)))
     for name, places in _PLACES.items():
         # a ball that does not roll is a solid sphere, which has no effect; a power would raise an OverflowError where a
         # product is inf
@@ -117,6 +138,8 @@ def _written(robot: Ballbot) -> ElementTree.Element:
         for query, attribute in places:
             if (element := urdf.root.find(query)) is not None:  # only a ball that rolls collides
                 element.set(attribute, f"0 0 {value!r}" if attribute == "xyz" else repr(value))
+    if isinstance(robot, GeneralOmni):
+        urdf.element(_CENTRE).set("xyz", f"{robot.com_x!r} {robot.com_y!r} {robot.com_height!r}")
     ball = urdf.element(_BALL[:-1])
     if (contact := ball.find("contact")) is not None:
         ball.remove(contact)
@@ -169,6 +192,11 @@ class _Urdf:
         if (element := elements[0].find(inner or ".")) is None:
             raise self.error(f"{called} has no <{inner.replace('/', '><')}>")
         return element
+
+    def vector(self, query: str) -> tuple[float, ...]:
+        """The three numbers of an element's xyz."""
+        self.number(query, "xyz")
+        return _parts(self.element(query).get("xyz", ""))  # pyright: ignore[reportReturnType]  checked above
 
     def number(self, query: str, attribute: str) -> float:
         """A number, of a vector the last."""

@@ -16,6 +16,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from typing import Any
 try:
     from rich.table import Table
 
-    from ballbot_train.work.console import PlainConsole, console
+    from ballbot_train.work.console import PlainConsole, console, print_table
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 
@@ -163,7 +164,7 @@ def _registered(options: list[str]) -> list[str]:
     or of its counterpart, a task with hyphens, and "pybullet".
     """
     from ballbot_gym.engines import PHYSICS_ALIASES
-    from ballbot_gym.robot import register_robot, short_name
+    from ballbot_gym.robot import short_name
 
     named = []
     for option in options:
@@ -172,11 +173,8 @@ def _registered(options: list[str]) -> list[str]:
             if os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())  # last, so that no file here takes the place of a library
             word = short_name(word)
-        elif word.endswith(".urdf") and "--robot" in (flag, *named[-1:]):
-            path = Path(word)
-            word = re.sub("[^a-z0-9_]", "_", path.stem.lower())
-            word = word if word[:1].isalpha() else f"robot_{word}"
-            register_robot(word, path)
+        elif word.endswith((".urdf", ".xml", ".mjcf")) and "--robot" in (flag, *named[-1:]):
+            word = _registered_file(Path(word))
         elif _ID.fullmatch(word) and "--out" not in (flag, *named[-1:]):
             from ballbot_gym.tasks import TASKS
 
@@ -189,6 +187,32 @@ def _registered(options: list[str]) -> list[str]:
             word = PHYSICS_ALIASES[word]
         named.append(f"{flag}{equals}{word}")
     return named
+
+
+def _registered_file(path: Path) -> str:
+    """The name under which the robot of a URDF or an MJCF was registered. The numbers that MuJoCo read are printed.
+
+    Robots whose wheels and centre of mass may be anywhere have the episodes of "omni", which are gentle.
+    """
+    from ballbot_gym.robot import ROBOTS, GeneralOmni, read_urdf, register_robot
+
+    name = re.sub("[^a-z0-9_]", "_", path.stem.lower())
+    name = name if name[:1].isalpha() else f"robot_{name}"
+    if path.suffix == ".urdf":
+        robot = read_urdf(path)
+    else:
+        from ballbot_gym.engines import MujocoModel
+
+        robot = MujocoModel(path).robot
+        rows = [(key, f"{value:.5g}") for key, value in _numbers(asdict(robot))]
+        print_table(f"{path}, as MuJoCo reads it, in SI units", ("number", "value"), rows)
+    register_robot(name, robot, ROBOTS["omni"].fields if isinstance(robot, GeneralOmni) else None)
+    return name
+
+
+def _numbers(given: dict[str, Any], outer: str = "") -> Iterator[tuple[str, float]]:
+    for key, value in given.items():
+        yield from _numbers(value, f"{key}.") if isinstance(value, dict) else [(f"{outer}{key}", value)]
 
 
 def _imported_by_us(error: BaseException) -> bool:

@@ -249,7 +249,7 @@ def draw(
     """
     rng, params, drawn = partial(_rng, task, seed, purpose), named_robot(robot), []
     for i in episodes:
-        z = tuple(rng(i, 1).random(len(Randomization.DRAWN)).tolist()) if randomization.varies_episodes else ()
+        z = tuple(rng(i, 1).random(randomization.most_draws).tolist()) if randomization.varies_episodes else ()
         drawn.append((*task.sample(rng(i), params), randomization.draw(z, task.control_dt) if z else ()))
     x, c, robots = map(np.array, zip(*drawn, strict=True))
     return x, c, robots
@@ -447,7 +447,11 @@ def evaluate_fresh(
         np.concatenate([getattr(part, name) for part in parts]) for name in ("states", "constants", "drawn")
     )
     runs = [part.run for part in parts]
-    vary = {name: row for name, row in zip(Randomization.DRAWN, drawn.T, strict=False) if np.ptp(row) > 0}
+    vary = {
+        name: row
+        for name, row in zip((*Randomization.DRAWN, *Randomization.DISPLACED), drawn.T, strict=False)
+        if np.ptp(row) > 0
+    }
     names = limit_names(task, params)
     violated = torch.cat([run.violated for run in runs]).tolist()
     return FreshResult(

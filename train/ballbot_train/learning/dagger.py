@@ -239,7 +239,7 @@ class Dagger:
         """Labels the states of episodes: from their beginnings, and then, with new optima, from one that each came to."""
         task, randomization, robots, drawn = self._task, self._randomization, [self._params], np.zeros((1, 0))
         if randomization.varies_episodes:
-            draws = rng.random((_ROBOTS, len(Randomization.DRAWN)))
+            draws = rng.random((_ROBOTS, randomization.most_draws))
             drawn = np.array([randomization.draw(tuple(z), task.control_dt) for z in draws])
             robots = [randomization.robot(self._params, tuple(row)) for row in drawn.tolist()]
         each = -(-self.config.episodes_per_iteration // len(robots))
