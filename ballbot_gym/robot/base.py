@@ -142,6 +142,14 @@ class Robot(ABC):
         """The robot's own limits, each ≥ 0 where it holds, while u is applied in state x, and held for `hold` seconds."""
         return ()
 
+    def without_dry_friction(self: Own) -> Own:
+        """The same robot without dry friction in its drive, near which it has a linear model. See `overcoming`."""
+        return self
+
+    def overcoming(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """The action (m,) that moves the robot from state x (n,) as u (m,) would for dt seconds without dry friction."""
+        return u
+
     def extended(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (n, ...) and actions (m, ...) of a simpler model, in which tasks describe motions, as this robot's."""
         return x, u

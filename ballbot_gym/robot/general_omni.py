@@ -111,6 +111,16 @@ class GeneralOmni(Omni):
         states = states + self.rest()
         return states, self.turning_ball(states[: len(u)], u).clip(-self.force_limit, self.force_limit)
 
+    def without_dry_friction(self) -> "GeneralOmni":
+        return self._replaced(axle_friction=0.0)
+
+    def overcoming(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """Friction is that of the speeds that the wheels will have after dt: it also holds wheels that have yet to move."""
+        free = self.without_dry_friction()
+        after = free.step(np.asarray(x, np.float64), u, dt, free.substeps(dt))
+        speeds = self.wheels.radius * np.array(self.readings(after, u)[6:])
+        return u + self.axle_drag(speeds) * speeds
+
     def floor_force(self, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> FloorForce:
         fx, fy, normal = super().floor_force(x, u, acceleration)
         body = _Body.of(self, x)

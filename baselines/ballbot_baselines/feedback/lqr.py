@@ -57,7 +57,8 @@ class LqrController:
     """
 
     def __init__(self, task: Task, params: Robot):
-        self._task, self._params = task, params
+        self._task, self._robot = task, params
+        self._params = params.without_dry_friction()
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         task, params = self._task, self._params
@@ -86,7 +87,8 @@ class LqrController:
             i = int(np.argmin(np.sum((reference.x[:, :2] - x[:2]) ** 2, axis=1)))
         else:
             i = min(round((t - self._start) / self._task.control_dt), len(reference.x) - 1)
-        return reference.u[i] - self.gains.k[i] @ (x - reference.x[i])
+        u = reference.u[i] - self.gains.k[i] @ (x - reference.x[i])
+        return self._robot.overcoming(x, u, self._task.control_dt)
 
 
 def _closed_gains(model: LinearQuadratic) -> Gains:

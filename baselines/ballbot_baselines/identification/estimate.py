@@ -31,8 +31,11 @@ from ballbot_gym.robot import Ballbot
 _SPREADS = {
     "body_mass": 0.3, "ball_mass": 0.2, "com_height": 0.2, "inertia": 0.3, "axial_inertia": 0.3, "force_limit": 0.2,
     "wheels.no_load_speed": 0.2, "wheels.inertia": 0.4, "wheels.damping": 0.7, "wheels.spin_friction": 0.7,
+    "axle_friction": 1.5,
 }  # fmt: skip
 """Standard deviation of the logarithm of a robot's number: 0.2 is about 20 %."""
+_SIGNED_SPREADS = {"com_x": 0.01, "com_y": 0.01, "zenith": 0.03}
+"""Standard deviation of a robot's number that may have any sign, m and rad; of a `GeneralOmni` alone."""
 _MODEL_ERRORS = {
     "com_height": 0.002, "inertia": 0.005, "axial_inertia": 0.005, "force_limit": 0.001, "body_mass": 0.002,
     "ball_mass": 0.002, "wheels.no_load_speed": 0.01, "wheels.inertia": 0.015, "wheels.damping": 0.05,
@@ -128,7 +131,12 @@ class Problem:
         robot = [
             _Parameter(name, _UNITS[name], attrgetter(name)(self.robot), spread, positive=True)
             for name, spread in _SPREADS.items()
-            if "." not in name or name.partition(".")[0] in self.robot.PARTS
+            if hasattr(self.robot, name) or name.partition(".")[0] in self.robot.PARTS
+        ]
+        robot += [
+            _Parameter(name, _UNITS[name], getattr(self.robot, name), spread, positive=False)
+            for name, spread in _SIGNED_SPREADS.items()
+            if hasattr(self.robot, name)
         ]
         drive = [
             _Parameter("delay", "s", 0.0, _DELAY, positive=False),
@@ -159,7 +167,7 @@ class Problem:
 
     def robot_of(self, values: dict[str, Any]) -> Ballbot:
         """The robot with values by name. If the values are (B,), so are its numbers."""
-        own = {name: values[name] for name in _SPREADS if name in values and "." not in name}
+        own = {name: values[name] for name in (*_SPREADS, *_SIGNED_SPREADS) if name in values and "." not in name}
         if (inertia := getattr(self.robot, "ball_inertia", None)) is not None:
             own["ball_inertia"] = inertia * (own["ball_mass"] / self.robot.ball_mass)
         for part in self.robot.PARTS:
@@ -173,6 +181,8 @@ class Problem:
         for i, each in enumerate(self.parameters):
             if each.name in _SPREADS:
                 z[i] = np.log(attrgetter(each.name)(robot) / each.nominal) / each.spread
+            elif each.name in _SIGNED_SPREADS:
+                z[i] = (getattr(robot, each.name) - each.nominal) / each.spread
             elif each.name == "delay":
                 z[i] = (delay - each.nominal) / each.spread
         return z
@@ -259,7 +269,7 @@ class Problem:
 _UNITS = {
     "body_mass": "kg", "ball_mass": "kg", "com_height": "m", "inertia": "kg·m²", "axial_inertia": "kg·m²",
     "force_limit": "N", "wheels.no_load_speed": "rad/s", "wheels.inertia": "kg·m²", "wheels.damping": "N·m·s",
-    "wheels.spin_friction": "N·m",
+    "wheels.spin_friction": "N·m", "axle_friction": "N·m", "com_x": "m", "com_y": "m", "zenith": "rad",
 }  # fmt: skip
 
 

@@ -1,0 +1,151 @@
+"""A robot with wheels as it was built: wheels anywhere, centre of mass off the axis, dry friction in its axles."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ballbot_baselines import LqrController
+from ballbot_baselines.identification.estimate import Problem
+from ballbot_gym import BallbotEnv, GeneralOmni, Randomization, named_robot, read_urdf
+from ballbot_gym.engines import installed_physics, make_simulator
+from ballbot_gym.env import make_task
+from ballbot_gym.robot import Omni, urdf_text
+
+OMNI: Any = named_robot("omni")
+SAME = GeneralOmni.of(OMNI)
+ROBOT = replace(
+    SAME, com_x=0.03, com_y=-0.02, zenith=0.7, azimuth_1=0.1, azimuth_2=2.0, azimuth_3=4.4, axle_friction=0.2
+)
+LOSSLESS = replace(
+    ROBOT, axle_friction=0.0, wheels=replace(ROBOT.wheels, damping=0.0, spin_friction=0.0, no_load_speed=1e9)
+)
+
+
+@pytest.fixture
+def motions():
+    """(20, 11) states and (20, 3) forces."""
+    rng = np.random.default_rng(0)
+    return 0.5 * rng.normal(size=(20, 11)), 20 * rng.normal(size=(20, 3))
+
+
+def test_wheels_at_the_usual_places_and_a_centred_mass_are_the_usual_robot(motions):
+    x, u = motions
+    np.testing.assert_allclose(SAME.derivative(x, u), OMNI.derivative(x, u), atol=1e-11)
+    np.testing.assert_allclose(SAME.turning_ball(x, u[:, :2]), OMNI.turning_ball(x, u[:, :2]), atol=1e-11)
+    for state, force in zip(x, u, strict=True):
+        np.testing.assert_allclose(SAME.readings(state, force), OMNI.readings(state, force), atol=1e-11)
+        np.testing.assert_allclose(SAME.contact(state, force), OMNI.contact(state, force), atol=1e-10)
+        np.testing.assert_allclose(
+            SAME.torque_on_ball(state, tuple(force), force), OMNI.torque_on_ball(state, tuple(force), force), atol=1e-11
+        )
+
+
+def test_energy_grows_by_the_power_of_the_motors_where_nothing_rubs(motions):
+    h = 1e-6
+    for x, u in zip(*motions, strict=True):
+        slope = LOSSLESS.derivative(x, u)
+        gained = (LOSSLESS.energy(x + h * slope) - LOSSLESS.energy(x - h * slope)) / (2 * h)
+        speeds = LOSSLESS.wheels.radius * np.array(LOSSLESS.readings(x, u)[6:])
+        assert gained == pytest.approx(u @ speeds, rel=1e-5)
+
+
+def test_the_floor_gives_the_force_that_moves_ball_and_centre_of_mass(motions):
+    h = 1e-4
+    for x, u in zip(*motions, strict=True):
+        before, now, after = (LOSSLESS.step(x, u, t, 1) for t in (-h, 0.0, h))
+        body = [_centre_of_mass(LOSSLESS, state) for state in (before, now, after)]
+        ball = [np.array([*state[:2], 0.0]) for state in (before, now, after)]
+        faster = [(a - 2 * b + c) / h**2 for a, b, c in (body, ball)]
+        wanted = LOSSLESS.body_mass * faster[0] + LOSSLESS.ball_mass * faster[1] + [0, 0, LOSSLESS.weight]
+        np.testing.assert_allclose(LOSSLESS.contact(x, u), wanted, rtol=1e-3, atol=1e-2)
+
+
+def _centre_of_mass(robot, x):
+    gamma, theta, psi = x[2], x[3], x[8]
+    cos, sin = np.cos, np.sin
+    lean = np.array([[cos(gamma), 0, sin(gamma)], [0, 1, 0], [-sin(gamma), 0, cos(gamma)]])
+    lean = lean @ np.array([[1, 0, 0], [0, cos(theta), sin(theta)], [0, -sin(theta), cos(theta)]])
+    turned = lean @ np.array([[cos(psi), -sin(psi), 0], [sin(psi), cos(psi), 0], [0, 0, 1]])
+    return np.array([*x[:2], 0.0]) + turned @ np.array(robot.centre_of_mass)
+
+
+def test_it_rests_with_its_centre_of_mass_above_the_ball():
+    rest = ROBOT.rest()
+    assert np.abs(ROBOT.derivative(rest, np.zeros(3))).max() < 1e-12
+    np.testing.assert_allclose(_centre_of_mass(ROBOT, rest)[:2], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("physics", [name for name in installed_physics() if name != "rk4"])
+def test_engines_move_it_as_the_closed_form_does(physics):
+    robot = replace(ROBOT, friction=5.0)
+    simulator = make_simulator(physics, robot, 0.02)
+    x = np.array([0, 0, 0.05, -0.04, 0.1, 0.2, 0.1, 0, 0.5, 0.3, 0.4])
+    simulator.reset(tuple(x.tolist()))
+    found = x
+    for k in range(15):
+        u = np.array([3, -2, 1.0]) * np.cos(0.3 * k)
+        found, x = simulator.step(tuple(u)), robot.step(x, u, 0.02, 8)
+    np.testing.assert_allclose(found[:4], x[:4], atol=2e-3)
+    np.testing.assert_allclose(found[8:9], x[8:9], atol=2e-3)
+
+
+def test_its_urdf_is_read_back(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(urdf_text(ROBOT))
+    assert read_urdf(path) == ROBOT
+    assert type(named_robot("omni")) is Omni  # whose URDF has none of these numbers
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"zenith": 0.0}, "lie in a plane"),
+        ({"azimuth_2": 0.1}, "lie in a plane"),
+        ({"axle_friction": -1.0}, "axle_friction must be at least 0"),
+        ({"com_x": np.nan}, "com_x must be finite"),
+    ],
+)
+def test_numbers_out_of_range_are_named(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        replace(ROBOT, **wrong)
+
+
+def test_randomization_moves_the_centre_of_mass_and_the_wheels():
+    varied = Randomization(com_offset=0.01, wheel_error=0.02)
+    env = BallbotEnv(make_task("stabilize", "omni"), "rk4", robot=SAME, randomization=varied)
+    _, info = env.reset(seed=0)
+    drawn = dict(zip((*varied.DRAWN, *varied.DISPLACED), env.get_state().drawn, strict=True))
+    assert 0 < abs(drawn["com_x"]) < 0.05
+    robot: Any = varied.robot(SAME, env.get_state().drawn)
+    assert robot.zenith == pytest.approx(SAME.zenith + drawn["zenith"])
+    after = env.step(np.zeros(3))[4]["state"]
+    np.testing.assert_allclose(after, robot.step(info["state"], np.zeros(3), 0.02), atol=1e-9)
+    with pytest.raises(ValueError, match="give a GeneralOmni"):
+        BallbotEnv("stabilize", "rk4", robot="omni", randomization=varied).reset(seed=0)
+
+
+def test_lqr_brings_it_to_rest_despite_dry_friction():
+    task = make_task("stabilize", "omni")
+    robot = replace(SAME, com_x=0.01, com_y=-0.005, axle_friction=0.3)
+    controller = LqrController(task, robot)
+    x = robot.rest() + np.array([0.3, -0.2, 0.04, 0.02, *[0.0] * 7])
+    controller.reset(0.0, x, np.zeros(0))
+    for k in range(400):
+        x = robot.step(x, np.clip(controller.act(0.02 * k, x), -robot.force_limit, robot.force_limit), 0.02, 4)
+    np.testing.assert_allclose(x[:2], 0.0, atol=0.01)
+
+
+def test_identification_estimates_what_the_usual_robot_does_not_have():
+    names = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+    own = {each.name for each in Problem(ROBOT, names).parameters} - {
+        each.name for each in Problem(OMNI, names).parameters
+    }
+    assert own == {"com_x", "com_y", "zenith", "axle_friction"}
+    moved = replace(ROBOT, com_x=0.02, axle_friction=0.3)
+    problem = Problem(ROBOT, names)
+    z = problem.z_of(moved, 0.0, np.zeros(len(problem.parameters)))
+    values = {name: float(value[0]) for name, value in problem.values(z[None]).items()}
+    found: Any = problem.robot_of(values)
+    assert (found.com_x, found.axle_friction) == (pytest.approx(0.02), pytest.approx(0.3))
