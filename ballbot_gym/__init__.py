@@ -41,6 +41,7 @@ from ballbot_gym.tasks.weave import Weave
 from ballbot_gym.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from ballbot_gym.engines import MujocoModel
     from ballbot_gym.vector import BallbotVectorEnv
     from ballbot_gym.vector.batch import BallbotBatch
 
@@ -56,6 +57,7 @@ __all__ = [
     "Episode",
     "GeneralOmni",
     "Marker",
+    "MujocoModel",
     "Omni",
     "Orbit",
     "PointBall",
@@ -86,8 +88,8 @@ __all__ = [
 ]
 
 __getattr__ = exports(
-    __name__, {"BallbotBatch": "vector.batch", "BallbotVectorEnv": "vector"}
-)  # torch is imported for them
+    __name__, {"BallbotBatch": "vector.batch", "BallbotVectorEnv": "vector", "MujocoModel": "engines"}
+)  # torch is imported for the first two
 
 try:
     __version__ = importlib.metadata.version("ballbot-gym")

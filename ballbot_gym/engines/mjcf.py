@@ -473,7 +473,7 @@ class MujocoModel:
         return found
 
     def _felt(self) -> np.ndarray:
-        """(6,) what gyroscope, rad/s, and accelerometer, m/s², read, the latter on the axis beside the centre of mass."""
+        """(6,) what gyroscope, rad/s, and accelerometer, m/s², read: on the axis, at the height of the centre of mass."""
         mujoco, data, base = self._mujoco, self.data, self._base
         mujoco.mj_rnePostConstraint(self.model, data)
         moved, turned = np.empty(6), np.empty(6)

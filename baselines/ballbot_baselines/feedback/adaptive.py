@@ -11,6 +11,7 @@ The friction of the floor cannot be measured before the robot slips, so plans as
 """
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -42,10 +43,18 @@ class FilteredController:
     track. It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
     """
 
-    def __init__(self, task: Task, params: Robot, ending: str, controller: Controller):
+    def __init__(
+        self,
+        task: Task,
+        params: Robot,
+        ending: str,
+        controller: Controller,
+        errors: Mapping[str, float] | None = None,
+    ):
+        """Args: errors: of sensors and model, same as in `SensorFilter`; the other filters have those of their tracks."""
         self._task, self._params, self._controller = task, params, controller
         self.senses = bool(params.SENSORS) and ending == "-ekf"
-        self.filter = SensorFilter(task, params) if self.senses else TrackFilter(task, params, _TRACKS[ending])
+        self.filter = SensorFilter(task, params, errors) if self.senses else TrackFilter(task, params, _TRACKS[ending])
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._start = c, t

@@ -14,6 +14,7 @@ and the model then predicts the state at its end. Before the first reading the f
 the task's initial states, at the start position of the episode.
 """
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -201,12 +202,23 @@ class SensorFilter:
     factors, delay = np.ones(3), 0
     model_variance = np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
 
-    def __init__(self, task: Task, params: Robot):
+    def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
+        """Makes the filter; `reset` starts it.
+
+        Args:
+            task: whose control steps it follows.
+            params: the robot.
+            errors: what `ballbot identify` found of sensors and model, by the names in its numbers.json: "gyro noise",
+                "accel noise", "wheel_angle noise", "accel_x bias", …, "speed drift" and "lean rate drift". Default, and for
+                names that are missing, those of `ballbot_gym.robot.sensors`.
+        """
         self._task, self._params, self._dt = task, params, task.control_dt
         self.model, (self._after, self._over_step) = _robot_and_sensors(params), _control_step(params, task.control_dt)
         samples = Sensors(params, task.control_dt).samples
         noise = [Sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [Sensors.ACCELEROMETER_NOISE**2 / samples] * 3
         self.reading_variance = np.array([*noise, *[Sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        self._bias = np.zeros(9)
+        self._set_errors(errors or {})
         self._noise = np.diag(self.reading_variance)
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
@@ -226,6 +238,16 @@ class SensorFilter:
         self._p[:, :11] = self._p[:, :11] @ slopes.T
         self._p += np.diag(self.model_variance)
 
+    def _set_errors(self, errors: Mapping[str, float]) -> None:
+        for i, name in enumerate(("gyro", "accel", "wheel_angle")):
+            if (noise := errors.get(f"{name} noise")) is not None:
+                # an angle in the control step is the difference of two
+                self.reading_variance[3 * i : 3 * i + 3] = noise**2 * (2 if name == "wheel_angle" else 1)
+        self._bias[3:6] = [errors.get(f"accel_{axis} bias", 0.0) for axis in "xyz"]
+        if "speed drift" in errors and "lean rate drift" in errors:
+            speeds, rates = (self._dt * errors[f"{name} drift"] ** 2 for name in ("speed", "lean rate"))
+            self.model_variance = np.array([0] * 4 + [speeds] * 2 + [rates] * 2 + [0] + [rates] * 2 + [0] * 3)
+
     def expected_start(self, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is expected (14,) where an episode with constants c (nc,) begins, and its standard deviations."""
         draws = np.random.default_rng(0).random((_DRAWN, self._task.state_draws))
@@ -237,7 +259,7 @@ class SensorFilter:
     def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
         """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
         of_biases, turned = np.eye(9, 3), np.repeat([1.0, self._dt], (6, 3))
-        missed = np.asarray(seen[:9], np.float64) * Sensors.SCALE - turned * np.array(expected)[:, 0]
+        missed = np.asarray(seen[:9], np.float64) * Sensors.SCALE - self._bias - turned * np.array(expected)[:, 0]
         missed[:3] -= self._z[11:]
         h = np.hstack([turned[:, None] * np.array(slopes), of_biases])
         self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)

@@ -13,6 +13,7 @@ HORIZONS = (0.1, 0.5, 1.0)
 """How far ahead motions are predicted, s."""
 _SECONDS = 15.0  # of a log that are enough to judge signs and units
 _LOUDER, _LOOSER = 2.0, 4.0  # times the noise and drift that estimates start from: the robot is not the nominal one
+_FAR_LOOSER = 40.0  # the same of a robot that is far from the nominal one
 _CLEAR = 0.1  # how much likelier a log must be with another sign or unit, per time, as a logarithm
 _MOST = 50.0  # of a squared innovation over its variance: one that is wrong may be wrong without bounds
 _NONSENSE = 10.0  # mean of a squared innovation over its variance, plus the variance's logarithm
@@ -55,13 +56,10 @@ class Suspect(NamedTuple):
         columns = (*readings.names, *Readings.commanded(problem.robot))
         suspicions = [_Suspicion((), 1.0), *_suspicions(columns)]
         factors = np.array([[each.factor if name in each.names else 1.0 for name in columns] for each in suspicions])
-        lanes = problem.lanes(np.zeros((len(suspicions), len(problem.parameters))))
-        lanes = lanes._replace(noise=_LOUDER * lanes.noise, drift=_LOOSER * lanes.drift)
-        with np.errstate(all="ignore"):  # of filters that fail
-            found = Innovations.of(problem.robot, part, lanes, factors)
-            fails = ~(np.isfinite(found.missed) & (found.variance > 0) & (found.variance < np.inf))
-            variance = np.where(fails, 1.0, found.variance)
-            misfit = np.where(fails, _MOST, np.minimum(found.missed**2 / variance, _MOST) + np.log(variance))
+        misfit = _misfits(problem, part, factors, _LOOSER)
+        if _misfits(problem, part, factors[:1], _FAR_LOOSER).mean() < misfit[:, 0].mean():
+            # the robot is far from the nominal one: drift explains the log better, and no fault may do what drift can
+            misfit = _misfits(problem, part, factors, _FAR_LOOSER)
         scores = -0.5 * misfit.sum(axis=(0, 2))
         m = len(readings.names)
         scores += np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
@@ -83,6 +81,19 @@ class Suspect(NamedTuple):
             if each.factor == factor and not set(names) & set(each.names)
         )
         return cls(names, "has the wrong sign" if factor == -1 else _UNITS[factor], others)
+
+
+def _misfits(problem: Problem, part: Readings, factors: np.ndarray, looser: float) -> np.ndarray:
+    """(n, B, m) −2 log-likelihoods of readings, without a constant, where readings and commands are multiplied by factors
+    (B, m + k), and the nominal robot drifts more than estimates start from.
+    """
+    lanes = problem.lanes(np.zeros((len(factors), len(problem.parameters))))
+    lanes = lanes._replace(noise=_LOUDER * lanes.noise, drift=looser * lanes.drift)
+    with np.errstate(all="ignore"):  # of filters that fail
+        found = Innovations.of(problem.robot, part, lanes, factors)
+        fails = ~(np.isfinite(found.missed) & (found.variance > 0) & (found.variance < np.inf))
+        variance = np.where(fails, 1.0, found.variance)
+        return np.where(fails, _MOST, np.minimum(found.missed**2 / variance, _MOST) + np.log(variance))
 
 
 def _suspicions(columns: tuple[str, ...]) -> Iterator[_Suspicion]:
