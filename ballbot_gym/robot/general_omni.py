@@ -116,9 +116,9 @@ class GeneralOmni(Omni):
 
     def overcoming(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
         """Friction is that of the speeds that the wheels will have after dt: it also holds wheels that have yet to move."""
-        free = self.without_dry_friction()
-        after = free.step(np.asarray(x, np.float64), u, dt, free.substeps(dt))
-        speeds = self.wheels.radius * np.array(self.readings(after, u)[6:])
+        free, state, force = self.without_dry_friction(), tuple(x.tolist()), tuple(u.tolist())
+        after = free.step(state, force, dt, free.substeps(dt))
+        speeds = self.wheels.radius * np.array(self.readings(after, force)[6:])
         return u + self.axle_drag(speeds) * speeds
 
     def floor_force(self, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> FloorForce:

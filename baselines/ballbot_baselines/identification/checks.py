@@ -57,9 +57,6 @@ class Suspect(NamedTuple):
         suspicions = [_Suspicion((), 1.0), *_suspicions(columns)]
         factors = np.array([[each.factor if name in each.names else 1.0 for name in columns] for each in suspicions])
         misfit = _misfits(problem, part, factors, _LOOSER)
-        if _misfits(problem, part, factors[:1], _FAR_LOOSER).mean() < misfit[:, 0].mean():
-            # the robot is far from the nominal one: drift explains the log better, and no fault may do what drift can
-            misfit = _misfits(problem, part, factors, _FAR_LOOSER)
         scores = -0.5 * misfit.sum(axis=(0, 2))
         m = len(readings.names)
         scores += np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
@@ -70,7 +67,7 @@ class Suspect(NamedTuple):
                 "the readings contradict each other and the commands, whatever their signs and units: this is no log of such "
                 "a robot, or its columns are something else"
             )
-        if gains[best] < _CLEAR * last:
+        if gains[best] < _CLEAR * last or _explained_by_drift(problem, part, factors[[0, best]]):
             return None
         near = [int(i) for i in np.flatnonzero(gains > _NEARLY * gains[best])]
         first = min(near, key=lambda i: (len(suspicions[i].names), -gains[i]))
@@ -94,6 +91,16 @@ def _misfits(problem: Problem, part: Readings, factors: np.ndarray, looser: floa
         fails = ~(np.isfinite(found.missed) & (found.variance > 0) & (found.variance < np.inf))
         variance = np.where(fails, 1.0, found.variance)
         return np.where(fails, _MOST, np.minimum(found.missed**2 / variance, _MOST) + np.log(variance))
+
+
+def _explained_by_drift(problem: Problem, part: Readings, factors: np.ndarray) -> bool:
+    """Whether a log that is multiplied by the second factors (2, m + k) is likelier than as it is because its robot is far
+    from the nominal one: where the filter trusts the nominal robot less, it is not.
+    """
+    m = len(part.names)
+    misfit = _misfits(problem, part, factors, _FAR_LOOSER).sum(axis=(0, 2))
+    scores = -0.5 * misfit + np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
+    return bool(scores[1] - scores[0] < _CLEAR * len(part.t))
 
 
 def _suspicions(columns: tuple[str, ...]) -> Iterator[_Suspicion]:
