@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ballbot_baselines import LqrController
+from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.identification.estimate import Problem
 from ballbot_gym import BallbotEnv, GeneralOmni, Randomization, named_robot, read_urdf
 from ballbot_gym.engines import installed_physics, make_simulator
@@ -149,3 +150,16 @@ def test_identification_estimates_what_the_usual_robot_does_not_have():
     values = {name: float(value[0]) for name, value in problem.values(z[None]).items()}
     found: Any = problem.robot_of(values)
     assert (found.com_x, found.axle_friction) == (pytest.approx(0.02), pytest.approx(0.3))
+
+
+def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_of_mass_it_does_not_know():
+    task = make_task("stabilize", "omni")
+    robot = replace(SAME, com_x=0.004, axle_friction=0.3)
+    known = replace(SAME, axle_friction=0.1)
+    env = BallbotEnv(task, "rk4", robot=robot, observation="sensors")
+    seen, info = env.reset(seed=1, options={"state": np.array([0.3, -0.2, 0.03, 0.02, *[0.0] * 7])})
+    controller = FilteredController(task, known, "-ekf", LqrController(task, known))
+    controller.reset(0.0, seen, np.zeros(0))
+    for k in range(400):
+        seen, *_, info = env.step(controller.act(0.02 * k, seen) / known.force_limit)
+    np.testing.assert_allclose(info["state"][:2], 0.0, atol=0.05)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.feedback.kalman import SensorFilter, TrackFilter
+from ballbot_baselines.feedback.kalman import DisturbanceFilter, SensorFilter, TrackFilter
 from ballbot_baselines.feedback.nmpc import BACKOFF, NmpcController
 from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.robot import TRACKS, Robot
@@ -54,7 +54,9 @@ class FilteredController:
         """Args: errors: of sensors and model, same as in `SensorFilter`; the other filters have those of their tracks."""
         self._task, self._params, self._controller = task, params, controller
         self.senses = bool(params.SENSORS) and ending == "-ekf"
-        self.filter = SensorFilter(task, params, errors) if self.senses else TrackFilter(task, params, _TRACKS[ending])
+        rubs = self.senses and params.without_dry_friction() != params
+        of_sensors = DisturbanceFilter if rubs else SensorFilter
+        self.filter = of_sensors(task, params, errors) if self.senses else TrackFilter(task, params, _TRACKS[ending])
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._start = c, t
@@ -68,6 +70,7 @@ class FilteredController:
         limit = self._params.force_limit
         # the robot applies only a share of the command
         u = self._controller.act(self._when_free(t), self.filter.when_free()) / self.filter.factors[..., 2:]
+        u = u - self.filter.disturbance
         self._u = np.clip(u, -limit, limit)
         return self._u
 

@@ -49,6 +49,8 @@ class TrackFilter:
     | `delay` | (...) | control steps from a command to its force |
     """
 
+    disturbance = 0.0  # it has factors instead
+
     def __init__(self, task: Task, params: Robot, track: Randomization):
         if not params.TRACK_FILTERS:
             raise ValueError("filters for tracks do not support robots with wheels; give lqr, trajopt or nmpc")
@@ -180,6 +182,9 @@ def _corrected(
     return z + np.einsum("...ij,...j->...i", gain, missed), p, spread
 
 
+_SHARE = 0.1  # of the force limit: what the force of a wheel may differ by
+_CHANGES = 0.1  # s in which it changes by that
+_ACCELEROMETER_BIAS = 0.2  # m/s², standard deviation
 _DRAWN = 256  # starts that tell what to expect of one
 _KNOWN = 1e-3  # standard deviation of what they all share, SI units
 
@@ -199,7 +204,7 @@ class SensorFilter:
     respect to x.
     """
 
-    factors, delay = np.ones(3), 0
+    factors, delay, disturbance = np.ones(3), 0, 0.0
     model_variance = np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
 
     def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
@@ -271,6 +276,60 @@ class SensorFilter:
     def when_free(self) -> np.ndarray:
         """The state (11,) in which the next command will act, which is the present one."""
         return self.x
+
+
+class DisturbanceFilter(SensorFilter):
+    """A `SensorFilter` that also estimates what a model with dry friction has wrong: two biases, and the wheels' forces.
+
+    No model has dry friction exactly near rest. So the filter estimates by how much the force of each wheel differs from
+    that of the model. Controllers subtract this `disturbance` (3,), N, from their forces. The biases are those of the
+    accelerometer across the body's axis. They include errors of where the centre of mass is, because the motion alone shows
+    how far a centre of mass leans.
+    """
+
+    def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
+        super().__init__(task, params, errors)
+        self._force = (_SHARE * params.force_limit) ** 2
+        self._of_biases = np.hstack([np.eye(9, 3), np.eye(9, 5)[:, 3:]])
+
+    def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
+        self.disturbance = np.zeros(3)
+        super().reset(seen, c)
+        self._z = np.concatenate([self._z, np.zeros(5)])
+        covariance = np.diag([0.0] * 14 + [_ACCELEROMETER_BIAS**2] * 2 + [self._force] * 3)
+        covariance[:14, :14] = self._p
+        self._p = covariance
+
+    def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
+        limit = self._params.force_limit
+        u = np.clip(u, -limit, limit)
+        self._correct(seen, *self._with_slopes(self._over_step, u))
+        after, slopes = self._with_slopes(self._after, u)
+        moves = np.eye(19)
+        moves[:11, :11], moves[:11, 16:] = slopes[:, :11], slopes[:, 11:]
+        self._z[:11] = after[:, 0]
+        self._p = moves @ self._p @ moves.T
+        self._p += np.diag([*self.model_variance, 0.0, 0.0, *[self._dt / _CHANGES * self._force] * 3])
+        self.disturbance = self._z[16:].copy()
+
+    def _with_slopes(self, function: casadi.Function, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The value (n, 1) of a function at the estimate, and its slopes (n, 14) in the state and in the wheels' forces."""
+        x, force, step = self._z[:11], u + self._z[16:], 1e-3 * self._params.force_limit
+        value, slopes = function(x, force)
+        moved = [np.array(function(x, force + step * unit)[0])[:, 0] for unit in np.eye(3)]
+        by_force = (np.stack(moved, axis=1) - np.array(value)) / step
+        return np.array(value), np.hstack([np.array(slopes), by_force])
+
+    def _correct(self, seen: np.ndarray, expected: Any, slopes: Any) -> None:
+        if len(self._z) == 14:  # the first readings, of wheels that are not driven
+            super()._correct(seen, expected, slopes)
+            return
+        turned = np.repeat([1.0, self._dt], (6, 3))
+        missed = np.asarray(seen[:9], np.float64) * Sensors.SCALE - self._bias - turned * expected[:, 0]
+        missed -= self._of_biases @ self._z[11:16]
+        slopes = turned[:, None] * slopes
+        h = np.hstack([slopes[:, :11], self._of_biases, slopes[:, 11:]])
+        self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
 
 
 class StateFromSensors(gymnasium.Wrapper):
