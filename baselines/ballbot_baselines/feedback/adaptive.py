@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.feedback.kalman import DisturbanceFilter, SensorFilter, TrackFilter
+from ballbot_baselines.feedback.kalman import SensorFilter, TrackFilter, _DisturbanceFilter
 from ballbot_baselines.feedback.nmpc import BACKOFF, NmpcController
 from ballbot_baselines.solvers.shooting import Backoff
 from ballbot_gym.robot import TRACKS, Robot
@@ -55,7 +55,7 @@ class FilteredController:
         self._task, self._params, self._controller = task, params, controller
         self.senses = bool(params.SENSORS) and ending == "-ekf"
         rubs = self.senses and params.without_dry_friction() != params
-        of_sensors = DisturbanceFilter if rubs else SensorFilter
+        of_sensors = _DisturbanceFilter if rubs else SensorFilter
         self.filter = of_sensors(task, params, errors) if self.senses else TrackFilter(task, params, _TRACKS[ending])
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:

@@ -278,7 +278,7 @@ class SensorFilter:
         return self.x
 
 
-class DisturbanceFilter(SensorFilter):
+class _DisturbanceFilter(SensorFilter):
     """A `SensorFilter` that also estimates what a model with dry friction has wrong: two biases, and the wheels' forces.
 
     No model has dry friction exactly near rest. So the filter estimates by how much the force of each wheel differs from
