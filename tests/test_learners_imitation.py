@@ -14,8 +14,10 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import dagger, routing, training
+from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.network import PolicyNetwork
 
 CLONING = dagger.DaggerConfig(iterations=4, gathering_iterations=0, gradient_steps=20, batch_size=128, hidden=(16,))
 TINY_DAGGER = dagger.DaggerConfig(
@@ -89,6 +91,21 @@ def test_dagger_labels_what_it_meets(name, monkeypatch):
     assert state["observations"].shape[1] == len(task.observation_scale)
     assert state["observations"].isfinite().all()
     assert state["actions"].abs().max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "symmetry"), [("stabilize", "odd"), ("orbit", "centred"), ("turn", "frame"), ("weave", "routes")]
+)
+def test_fits_act_as_the_policy_does(name, symmetry):
+    """What depends on observations alone is computed for many batches at once, and gives the same actions."""
+    task, params, rng = make_task(name), default_params(), np.random.default_rng(0)
+    network = PolicyNetwork(spec_for(task, symmetry, (16,), True, activation="silu"))
+    torch.nn.init.normal_(network.mlp[-1].weight)
+    x, c = map(np.array, zip(*(task.sample(rng, params) for _ in range(50)), strict=True))
+    seen = torch.as_tensor(np.asarray(task.observe(x + 0.1 * rng.standard_normal(x.shape), c), np.float32))
+    actions = network(seen)
+    assert actions.abs().max() > 0.1
+    torch.testing.assert_close(network.acting(network.prepared(seen)), actions)
 
 
 def feedback_errors(task, plan, c, backoff, gains, scale):

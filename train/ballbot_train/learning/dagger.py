@@ -35,7 +35,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
-from ballbot_gym.vector.episodes import run_episodes
+from ballbot_train.evaluation import fresh
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, actor_for
 from ballbot_train.learning.datasets import load_demos
@@ -165,6 +165,8 @@ class _Labels(Samples):
     """(8,) standard deviations of δ at most, SI units."""
     observe: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
     """From states (m, 8) and constants (m, nc) to observations (m, no)."""
+    prepare: Callable[[torch.Tensor], torch.Tensor]
+    """`PolicyNetwork.prepared` of observations (m, no)."""
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         rows = torch.as_tensor(rng.integers(len(self), size=count))
@@ -173,11 +175,11 @@ class _Labels(Samples):
         if known.any():
             share = rng.random((count, 1), dtype=np.float32) * self.around
             off = torch.as_tensor(share * rng.standard_normal(share.shape, dtype=np.float32))
-            change = (self.gains[rows] @ off[..., None])[..., 0]
+            change = (self.gains[rows] * off[:, None]).sum(2)
             less = _SMALL / change.abs().amax(1, keepdim=True).clamp(min=_SMALL)
             actions = (actions - less * change).clamp(-1, 1).where(known, actions)
             observations = self.observe(states + less * off, self.constants[rows]).where(known, observations)
-        return observations, actions, self.weights[rows]
+        return self.prepare(observations), actions, self.weights[rows]
 
 
 class Dagger:
@@ -209,7 +211,7 @@ class Dagger:
         """Whether samples label the states around them too; see the top of this file."""
         # slopes are fitted best by smooth layers that are not bounded
         self.network = actor_for(task, params, config, history, False, start, "silu" if self._around else "tanh")
-        self._fit = Fit(self.network)
+        self._fit = Fit(self.network, self.network.acting)
         empty = np.zeros((0, self.network.spec.seen)), np.zeros((0, params.action_size)), np.zeros(0)
         self._samples = self._samples_of(*(shown or empty))
 
@@ -268,8 +270,9 @@ class Dagger:
         x, c = map(np.array, zip(*(self._task.sample(rng, self._params) for _ in range(some + among)), strict=True))
         if not hard:
             return x, c
-        batch = BallbotBatch(self._task, among, compile=False, params=self._params, history=self._history)
-        success = run_episodes(batch, self.network, x[some:], c[some:]).success.numpy()
+        robot = registered_name(self._params)
+        ran = fresh.run_policy(self.network, self._task, x[some:], c[some:], np.zeros((among, 0)), robot)
+        success = ran.success.numpy()
         rows = np.append(np.arange(some), some + np.argsort(success, kind="stable")[:hard])
         rng.shuffle(rows)
         return x[rows], c[rows]
@@ -362,7 +365,8 @@ class Dagger:
         more = around or [np.full((len(own), *shape), np.nan) for shape in shapes]
         tensors = (torch.as_tensor(part, dtype=torch.float32) for part in more)
         scale = np.array([_AROUND.get(quantity.unit, 0.0) for quantity in params.STATE], np.float32)
-        return _Labels(own.observations, own.actions, own.weights, *tensors, around=scale, observe=self._observed)
+        functions: Any = {"observe": self._observed, "prepare": self.network.prepared}
+        return _Labels(own.observations, own.actions, own.weights, *tensors, around=scale, **functions)
 
     def _observed(self, states: torch.Tensor, constants: torch.Tensor) -> torch.Tensor:
         """Observations (n, no) of states (n, 8) of episodes with constants (n, nc)."""

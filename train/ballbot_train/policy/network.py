@@ -88,8 +88,43 @@ class PolicyNetwork(torch.nn.Module):
         return self.spec.history
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        raw = self.raw(observation)
+        return self._squashed(self.raw(observation))
+
+    def _squashed(self, raw: torch.Tensor) -> torch.Tensor:
         return torch.tanh(raw) if self.spec.squash == "tanh" else raw.clamp(-1.0, 1.0)
+
+    @torch.no_grad()
+    def prepared(self, observation: torch.Tensor) -> torch.Tensor:
+        """(B, k) all of a policy that depends on observations (B, no) alone, and not on its layers; see `acting`.
+
+        A frame's many small steps take about as long for thousands of observations as for one, so it pays to compute many
+        batches of a fit at once. Informed policies are not supported.
+        """
+        if self._frame is None:
+            return observation
+        features, back = self.features(self._seen(observation))
+        one = torch.ones_like(features[0])
+        axes = *back((one, 0.0 * one)), *back((0.0 * one, one))
+        steady = ()
+        if self.spec.centred:
+            kept, action = self.kept(features)
+            steady = *kept, *self._needed(_stacked(action, observation)).unbind(-1)
+        return _stacked((*features, *axes, *steady), observation)
+
+    def acting(self, prepared: torch.Tensor) -> torch.Tensor:
+        """Actions (B, 2) for what `prepared` gives of observations: those of `forward`, to rounding."""
+        if self._frame is None:
+            return self(prepared)
+        if self.spec.centred:
+            size = (prepared.shape[-1] - 6) // 2
+            inputs, axes, kept, needed = prepared.split_with_sizes([size, 4, size, 2], -1)
+            output, steady = self._sum(torch.cat([inputs, kept])).chunk(2)
+            action = output - steady + needed
+        else:
+            inputs, axes = prepared.split_with_sizes([prepared.shape[-1] - 4, 4], -1)
+            action = self._sum(inputs)
+        action = self._reached(action)
+        return self._squashed(action[:, :1] * axes[:, :2] + action[:, 1:] * axes[:, 2:])
 
     def knowing(self, observation: torch.Tensor, state: "BatchState", track: Randomization) -> torch.Tensor:
         """Actions (B, 2) for observations (B, no) without the robots' parameters, which an informed policy needs.
@@ -124,7 +159,9 @@ class PolicyNetwork(torch.nn.Module):
 
     def in_frame(self, inputs: torch.Tensor, features: tuple[Any, ...] | None = None) -> torch.Tensor:
         """(..., 2) in the frame, as `raw` in the world, for features (..., n) of the frame, also one by one."""
-        action = self.centred(self._sum(inputs), inputs.unbind(-1) if features is None else features)
+        return self._reached(self.centred(self._sum(inputs), inputs.unbind(-1) if features is None else features))
+
+    def _reached(self, action: torch.Tensor) -> torch.Tensor:
         return REACH * torch.tanh(action) if self.spec.squash == "tanh_in_frame" else action
 
     def _seen(self, observation: torch.Tensor, plain: bool = False) -> tuple[Any, ...]:
@@ -164,11 +201,14 @@ class PolicyNetwork(torch.nn.Module):
             return output
         kept, action = self.kept(features)
         output = output - self._sum(_stacked(kept, output))
-        needed = _stacked(action, output)
-        if self.spec.squash != "clip":
-            reach = REACH if self.spec.squash == "tanh_in_frame" else 1
-            needed = (needed / reach).clamp(-0.999, 0.999).atanh()
-        return output + needed
+        return output + self._needed(_stacked(action, output))
+
+    def _needed(self, action: torch.Tensor) -> torch.Tensor:
+        """What the network must give for an action (..., 2) in the frame, before it is squashed."""
+        if self.spec.squash == "clip":
+            return action
+        reach = REACH if self.spec.squash == "tanh_in_frame" else 1
+        return (action / reach).clamp(-0.999, 0.999).atanh()
 
     def kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
         """Features of the steady motion, as if it had lasted for the whole history, and the action that keeps it."""
