@@ -8,13 +8,13 @@ structured prediction to no-regret online learning", 2011, with the mixture β o
 The feedback about an optimum is the derivative of the optimal force with respect to the state. It labels every state that an
 episode reaches near its optimum, and the states around it too: every batch draws new ones, whose labels differ by −K δ. This
 fits the slope of the policy together with its value, as in Czarnecki et al., "Sobolev training for neural networks" (2017).
-There are four exceptions, whose states label themselves alone. If a goal ends the episode, the derivative is that for a
-given time of arrival, which a policy does not observe. Next to an obstacle, the derivative is steep and holds for small
-changes alone. If observations depend on the past, on noise or on delayed forces, they are not known for other states. And
-on tasks with a moving reference, policies that are as good have not been measured yet.
+There are three exceptions, whose states label themselves alone, with errors divided by the cost of the episode's optimum, as
+in the regret. If a goal ends the episode, the derivative is that for a given time of arrival, and steep before the goal. Next
+to an obstacle it is steep too, and policies that are as good have not been measured yet. If observations depend on the past,
+on noise or on delayed forces, they are not known for other states.
 
-Errors are divided by the cost of the episode's optimum, as in the regret. On a track the expert has access to each episode's
-robot. The learner gets observations alone.
+A share of the episodes begins where the learner fails or pays most, because failures are at the edge of what can be recovered
+from. On a track the expert has access to each episode's robot. The learner gets observations alone.
 """
 
 import contextlib
@@ -73,7 +73,7 @@ class DaggerConfig(Settings):
 
 TUNED: dict[str, DaggerConfig] = {
     "": DaggerConfig(),
-    # few samples suffice that label the states around them too
+    # few samples suffice that label the states around them too, as on Orbit
     "stabilize": DaggerConfig(
         iterations=20,
         gathering_iterations=2,
@@ -86,7 +86,16 @@ TUNED: dict[str, DaggerConfig] = {
     ),
     "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
     # plans at the force limit leave no force for corrections
-    "orbit": DaggerConfig(symmetry="frame", hidden=(256, 256), backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
+    "orbit": DaggerConfig(
+        iterations=20,
+        gathering_iterations=3,
+        evaluations=5,
+        batch_size=256,
+        learning_rate=1e-2,
+        hidden=(64, 64),
+        symmetry="centred",
+        backoff=Backoff(force=0.06, grip=EXECUTED.grip),
+    ),
     "weave": DaggerConfig(
         symmetry="routes", hidden=(256, 256), backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip)
     ),
@@ -206,8 +215,7 @@ class Dagger:
         torch.manual_seed(seed)
         varied = self._randomization
         present = not (history or varied.varies_actuator or varied.is_noisy)
-        reference = task.reference(*task.sample(np.random.default_rng(0), params), params)
-        self._around = present and not task.first_exit and task.routed_frame is None and reference.is_point
+        self._around = present and not task.first_exit and task.routed_frame is None
         """Whether samples label the states around them too; see the top of this file."""
         # slopes are fitted best by smooth layers that are not bounded
         self.network = actor_for(task, params, config, history, False, start, "silu" if self._around else "tanh")
@@ -262,8 +270,8 @@ class Dagger:
         return {"train/labelled": float(np.mean([optima.solved, again.solved]))}
 
     def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Initial states (count, 8) and constants (count, nc). As far as there are some, a share are ones of many drawn in
-        which the learner does not succeed.
+        """Initial states (count, 8) and constants (count, nc). As far as there are some, a share are the hardest
+        of many drawn: those in which the learner does not succeed, and then those that cost it most.
         """
         hard = round(_HARD_SHARE * count) if self.iteration else 0
         some, among = count - hard, _HARD_AMONG * hard
@@ -272,8 +280,8 @@ class Dagger:
             return x, c
         robot = registered_name(self._params)
         ran = fresh.run_policy(self.network, self._task, x[some:], c[some:], np.zeros((among, 0)), robot)
-        success = ran.success.numpy()
-        rows = np.append(np.arange(some), some + np.argsort(success, kind="stable")[:hard])
+        hardest = np.lexsort((-ran.cost.numpy(), ran.success.numpy()))
+        rows = np.append(np.arange(some), some + hardest[:hard])
         rng.shuffle(rows)
         return x[rows], c[rows]
 
@@ -322,9 +330,8 @@ class Dagger:
             share = 0.5 * _STATES / math.sqrt(steps * (k + 0.5)) if self._around else _STATES / steps
             near &= running & usable & (rng.random(len(near)) < share)
             around = (x[near], c[near], gains[near]) if self._around else None
-            found.append(
-                self._samples_of(observation[near].numpy(), label[near], 1 / np.maximum(costs[near], _MIN_COST), around)
-            )
+            weights = np.ones(near.sum()) if self._around else 1 / np.maximum(costs[near], _MIN_COST)
+            found.append(self._samples_of(observation[near].numpy(), label[near], weights, around))
             with torch.no_grad():
                 actions = np.where(expert, label + noise * rng.standard_normal(label.shape), self.network(observation))
             state, result = batch.transition(state, torch.as_tensor(actions))
