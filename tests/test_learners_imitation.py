@@ -191,8 +191,8 @@ def test_dagger_falls_far_less_than_lqr_after_two_rounds():
     small = {
         "iterations": 4,
         "gathering_iterations": 2,
-        "episodes_per_iteration": 32,
-        "gradient_steps": 300,
+        "episodes_per_iteration": 64,
+        "gradient_steps": 600,
         "batch_size": 256,
         "hidden": (64,),
     }

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ballbot_gym import ops
 from ballbot_gym.engines.mujoco import import_mujoco
 from ballbot_gym.engines.simulator import MOST_FRICTION
 from ballbot_gym.robot import GeneralOmni, Sensors, UrdfError, Wheels
@@ -313,13 +314,13 @@ class MujocoModel:
                 f"the axis of wheel {name!r} goes through the ball; it must pass it at the wheel's radius"
             )
         normal = nearest / distance
-        zenith, azimuth = math.acos(normal[2]), math.atan2(normal[1], normal[0])
+        zenith, azimuth = ops.arccos(float(normal[2])), math.atan2(normal[1], normal[0])
         wanted = -normal[2] * math.cos(azimuth), -normal[2] * math.sin(azimuth), math.hypot(normal[0], normal[1])
         along = float(axis @ wanted)
         if abs(along) < math.cos(_TILTED):
             raise self._error(
                 f"wheel {name!r} does not drive the ball around the body's axis: its own axis is "
-                f"{math.degrees(math.acos(min(abs(along), 1))):.0f}° out of the plane of the body's axis and the contact"
+                f"{math.degrees(ops.arccos(min(abs(along), 1.0))):.0f}° out of the plane of the body's axis and the contact"
             )
         dof = int(model.jnt_dofadr[j])
         gear, gain, limit, drag = self._motor(j, a, name)

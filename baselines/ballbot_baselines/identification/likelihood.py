@@ -23,6 +23,7 @@ import numpy as np
 
 from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
 from ballbot_gym.robot import Ballbot, Kind
+from ballbot_gym.tasks.paths import hermite_basis
 
 _STATES = {
     "position_x": "m", "position_y": "m", "lean_x": "rad", "lean_y": "rad",
@@ -189,11 +190,9 @@ def _impulses(ends: np.ndarray, commands: np.ndarray, at: np.ndarray) -> np.ndar
     step = dt[np.minimum(first, len(dt) - 1)][..., None]
     s = np.clip((at - ends[first])[..., None] / step, 0.0, 1.0)
     end_rate = np.where((later >= rows)[..., None], newest[np.broadcast_to(rows, at.shape)], rate[later])
-    inside = (
-        (1 + 2 * s) * (1 - s) ** 2 * total[first]
-        + s**2 * (3 - 2 * s) * total[later]
-        + step * s * (1 - s) * ((1 - s) * rate[first] - s * end_rate)
-    )
+    start, start_slope, end, end_slope = hermite_basis(s)
+    slopes = start_slope * rate[first] + end_slope * end_rate
+    inside = start * total[first] + end * total[later] + step * slopes
     early = np.minimum(at - ends[0], 0.0)[..., None] * commands[0]  # the first command is taken for those before
     return inside + early + np.maximum(at - ends[later], 0.0)[..., None] * end_rate
 
