@@ -152,6 +152,7 @@ def test_identification_estimates_what_the_usual_robot_does_not_have():
     assert (found.com_x, found.axle_friction) == (pytest.approx(0.02), pytest.approx(0.3))
 
 
+@pytest.mark.slow
 def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_of_mass_it_does_not_know():
     task = make_task("stabilize", "omni")
     robot = replace(SAME, com_x=0.004, axle_friction=0.3)

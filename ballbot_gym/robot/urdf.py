@@ -95,7 +95,8 @@ def read_urdf(path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -
     urdf = _Urdf(Path(path))
     rolls, has_wheels = (urdf.root.find(query) is not None for query in ("joint[@name='roll']", "wheels"))
     kind: type[Ballbot] = Omni if has_wheels else RollingBall if rolls else PointBall
-    off_axis, own = (0.0, 0.0), {}
+    off_axis = 0.0, 0.0
+    own: dict[str, Any] = {}
     if has_wheels:
         off_axis = urdf.vector(_CENTRE)[:2]
         given = urdf.element("wheels").attrib
