@@ -76,7 +76,10 @@ class _Parameter(NamedTuple):
 
     def value(self, z: Any) -> Any:
         """The value for z spreads away from the nominal one."""
-        return self.nominal * np.exp(self.spread * z) if self.positive else self.nominal + self.spread * z
+        if not self.positive:
+            return self.nominal + self.spread * z
+        with np.errstate(over="ignore"):  # of a search that tries too much
+            return self.nominal * np.exp(self.spread * z)
 
 
 class _Estimate(NamedTuple):
