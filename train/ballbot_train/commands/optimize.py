@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,8 @@ def optimize(
 
     Args:
         task: name of a task.
-        state: x y γ θ ẋ ẏ γ̇ θ̇ at the start, in m, rad, m/s, rad/s; default drawn with the seed.
+        state: x y γ θ ẋ ẏ γ̇ θ̇ at the start, in m, rad, m/s, rad/s; default drawn with the seed. Robots with wheels then
+            have a yaw of 0 and no spin.
         constants: constants of the episode by name, e.g. --constants speed 3; others are drawn with the seed.
         seed: seed of what is drawn.
         duration: longest episode, s.
@@ -44,7 +46,9 @@ def optimize(
             f"duration {duration:g} s is too long to optimize; give at most {_MOST_STEPS * problem.control_dt:g} s"
         )
     env = BallbotEnv(problem, physics="rk4", robot=robot)
-    options = {"constants": constants} | ({} if state is None else {"state": state})
+    options: dict[str, Any] = {"constants": constants}
+    if state is not None:
+        options["state"] = (*state, *[0.0] * (env.params.state_size - len(state)))
     _, info = env.reset(seed=seed, options=options)
     optimum = find_optimum(env.task, env.params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
