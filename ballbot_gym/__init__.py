@@ -41,7 +41,7 @@ from ballbot_gym.tasks.weave import Weave
 from ballbot_gym.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from ballbot_gym.engines import MujocoModel
+    from ballbot_gym.engines.mjcf import MujocoModel
     from ballbot_gym.vector import BallbotVectorEnv
     from ballbot_gym.vector.batch import BallbotBatch
 
@@ -88,7 +88,7 @@ __all__ = [
 ]
 
 __getattr__ = exports(
-    __name__, {"BallbotBatch": "vector.batch", "BallbotVectorEnv": "vector", "MujocoModel": "engines"}
+    __name__, {"BallbotBatch": "vector.batch", "BallbotVectorEnv": "vector", "MujocoModel": "engines.mjcf"}
 )  # torch is imported for the first two
 
 try:

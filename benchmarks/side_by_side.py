@@ -44,6 +44,8 @@ def main(other: Path, /, rounds: int = 9, out: Path = Path("runs/side_by_side"))
         rounds: how often each is measured.
         out: folder of the result.
     """
+    from ballbot_gym import files  # here, because the other checkout's processes import this file too
+
     checkouts = {"before": other.resolve(), "now": _HERE.parent}
     figures: dict[str, dict[str, list[float]]] = {}
     for turn in range(rounds + 1):
@@ -53,20 +55,19 @@ def main(other: Path, /, rounds: int = 9, out: Path = Path("runs/side_by_side"))
             for name, value in found.items():
                 if turn:
                     figures.setdefault(name, {}).setdefault(which, []).append(value)
-    lines = ["what,unit,before,now,ratio of speeds,least ratio,greatest ratio"]
+    rows = []
     for name, values in figures.items():
         whole = name in START_UPS
         pairs = zip(values["now"], values["before"], strict=True)
         ratios = sorted(before / now if whole else now / before for now, before in pairs)
-        medians = (statistics.median(values[which]) for which in ("before", "now"))
-        shown = [f"{value:.2f}" if whole else f"{value:.0f}" for value in medians]
-        spread = (statistics.median(ratios), ratios[0], ratios[-1])
-        lines.append(
-            f'"{name}",{"s" if whole else "steps/s"},{",".join([*shown, *(f"{each:.2f}" for each in spread)])}'
-        )
-        print(lines[-1], flush=True)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "side_by_side.csv").write_text("\n".join(lines) + "\n")
+        before, now = (statistics.median(values[which]) for which in ("before", "now"))
+        row: dict[str, str | float] = {"what": name, "unit": "s" if whole else "steps/s"}
+        row |= {"before": round(before, 2 if whole else 0), "now": round(now, 2 if whole else 0)}
+        row |= {"ratio of speeds": round(statistics.median(ratios), 2)}
+        row |= {"least ratio": round(ratios[0], 2), "greatest ratio": round(ratios[-1], 2)}
+        rows.append(row)
+        print(*row.values(), sep=", ", flush=True)
+    print(f"written: {files.write_csv(out / 'side_by_side.csv', rows)}")
 
 
 def _run(checkout: Path, code: str) -> str:
@@ -141,7 +142,7 @@ def _gradients() -> Callable[[], object]:
 
 
 def _speed(work: Callable[[], object], steps: int, seconds: float = 0.3) -> float:
-    """Control steps per second of work that takes so many."""
+    """Control steps per second of work that takes `steps` of them."""
     work()
     work()
     count, begin = 0, time.process_time()

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballbot_gym import BallbotEnv, GeneralOmni
-from ballbot_gym.engines import MujocoModel
+from ballbot_gym import BallbotEnv, GeneralOmni, MujocoModel
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Sensors, UrdfError
 from ballbot_train.cli import _run as run

@@ -8,7 +8,6 @@ from typing import Any
 from ballbot_gym.engines import bullet, mujoco
 from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.engines.mjcf import MujocoModel
 from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.lazy import install
 from ballbot_gym.robot import Robot
@@ -17,7 +16,6 @@ __all__ = [
     "PHYSICS",
     "PHYSICS_ALIASES",
     "PHYSICS_NAMES",
-    "MujocoModel",
     "Simulator",
     "State",
     "checked_physics",

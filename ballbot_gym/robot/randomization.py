@@ -18,7 +18,7 @@ _LARGEST = 1e6  # of any number
 _LARGEST_FACTOR = 1e3
 _MOST_DELAY_STEPS = 1000  # every one of them is remembered, and takes time in every step
 
-_NEWER = ("com_offset", "wheel_error")  # fields that version 1.0 did not have
+_NEWER = ("com_offset", "wheel_error")  # fields that the certified sets and policies were written without
 
 Range = tuple[float, float]
 """(low, high), both included; drawn uniformly."""
@@ -113,7 +113,7 @@ class Randomization:
             raise ValueError("Randomization: push_interval must be positive, not 0")
 
     def __repr__(self) -> str:
-        """The text that version 1.0 wrote of randomizations without newer fields, so that its files can be read."""
+        """Without newer fields that are at their default, so that files with the text of older randomizations can be read."""
         shown = [each.name for each in fields(self) if each.name not in _NEWER or getattr(self, each.name)]
         return f"Randomization({', '.join(f'{name}={getattr(self, name)!r}' for name in shown)})"
 
@@ -189,7 +189,7 @@ class Randomization:
 
     @cached_property
     def most_draws(self) -> int:
-        """Uniform numbers of which `draw` takes all or the first."""
+        """The most uniform numbers that `draw` takes, whatever varies; it leaves the last ones out where it needs fewer."""
         return max(len(self.DRAWN), self.episode_draws)
 
     @cached_property

@@ -129,9 +129,6 @@ def _written(robot: Ballbot) -> ElementTree.Element:
     for name, kind in robot.PARTS.items():  # an element of this name has an attribute for each number
         for field in fields(kind):
             urdf.element(name).set(field.name, repr(getattr(getattr(robot, name), field.name)))
-    if isinstance(robot, GeneralOmni):
-        for name in _AS_BUILT:
-            urdf.element("wheels").set(name, repr(getattr(robot, name)))
     for name, places in _PLACES.items():
         # a ball that does not roll is a solid sphere, which has no effect; a power would raise an OverflowError where a
         # product is inf
@@ -140,6 +137,8 @@ def _written(robot: Ballbot) -> ElementTree.Element:
             if (element := urdf.root.find(query)) is not None:  # only a ball that rolls collides
                 element.set(attribute, f"0 0 {value!r}" if attribute == "xyz" else repr(value))
     if isinstance(robot, GeneralOmni):
+        for name in _AS_BUILT:
+            urdf.element("wheels").set(name, repr(getattr(robot, name)))
         urdf.element(_CENTRE).set("xyz", f"{robot.com_x!r} {robot.com_y!r} {robot.com_height!r}")
     ball = urdf.element(_BALL[:-1])
     if (contact := ball.find("contact")) is not None:

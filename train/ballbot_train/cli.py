@@ -201,7 +201,7 @@ def _registered_file(path: Path) -> str:
     if path.suffix == ".urdf":
         robot = read_urdf(path)
     else:
-        from ballbot_gym.engines import MujocoModel
+        from ballbot_gym.engines.mjcf import MujocoModel
 
         robot = MujocoModel(path).robot
         rows = [(key, f"{value:.5g}") for key, value in _numbers(asdict(robot))]

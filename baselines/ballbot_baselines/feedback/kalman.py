@@ -185,6 +185,8 @@ def _corrected(
 _SHARE = 0.1  # of the force limit: what the force of a wheel may differ by
 _CHANGES = 0.1  # s in which it changes by that
 _ACCELEROMETER_BIAS = 0.2  # m/s², standard deviation
+_OF_GYROSCOPE, _OF_BOTH = np.eye(9, 3), np.eye(9, 5)
+"""Which of the sensors feel each bias: the gyroscope's three, and two of the accelerometer."""
 _DRAWN = 256  # starts that tell what to expect of one
 _KNOWN = 1e-3  # standard deviation of what they all share, SI units
 
@@ -236,7 +238,8 @@ class SensorFilter:
     def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
         """Takes what sensors show (no,) at the time t, s, after a control step with the wheels' forces u (3,), N."""
         u = np.clip(u, -self._params.force_limit, self._params.force_limit)
-        self._correct(seen, *self._over_step(self._z[:11], u))
+        expected, slopes = self._over_step(self._z[:11], u)
+        self._correct(seen, expected, slopes)
         after, slopes = self._after(self._z[:11], u)
         self._z[:11], slopes = np.array(after)[:, 0], np.array(slopes)
         self._p[:11] = slopes @ self._p[:11]
@@ -261,12 +264,20 @@ class SensorFilter:
         deviations = [*np.maximum(starts.std(0), _KNOWN), *[Sensors.GYROSCOPE_BIAS] * 3]
         return np.concatenate([starts.mean(0), np.zeros(3)]), np.array(deviations)
 
-    def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
-        """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
-        of_biases, turned = np.eye(9, 3), np.repeat([1.0, self._dt], (6, 3))
+    def _correct(self, seen: np.ndarray, expected: Any, slopes: Any, of_biases: np.ndarray = _OF_GYROSCOPE) -> None:
+        """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian.
+
+        Args:
+            seen: (no,) what sensors show.
+            expected: (9,) what they would show without biases.
+            slopes: (9, 11 or more) its derivatives in the state, and in all that follows the k biases.
+            of_biases: (9, k) where the biases are felt.
+        """
+        turned = np.repeat([1.0, self._dt], (6, 3))
         missed = np.asarray(seen[:9], np.float64) * Sensors.SCALE - self._bias - turned * np.array(expected)[:, 0]
-        missed[:3] -= self._z[11:]
-        h = np.hstack([turned[:, None] * np.array(slopes), of_biases])
+        missed -= of_biases @ self._z[11 : 11 + of_biases.shape[1]]
+        slopes = turned[:, None] * np.array(slopes)
+        h = np.hstack([slopes[:, :11], of_biases, slopes[:, 11:]])
         self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
 
     @property
@@ -290,7 +301,6 @@ class _DisturbanceFilter(SensorFilter):
     def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
         super().__init__(task, params, errors)
         self._force = (_SHARE * params.force_limit) ** 2
-        self._of_biases = np.hstack([np.eye(9, 3), np.eye(9, 5)[:, 3:]])
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
         self.disturbance = np.zeros(3)
@@ -303,7 +313,7 @@ class _DisturbanceFilter(SensorFilter):
     def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
         limit = self._params.force_limit
         u = np.clip(u, -limit, limit)
-        self._correct(seen, *self._with_slopes(self._over_step, u))
+        self._correct(seen, *self._with_slopes(self._over_step, u), _OF_BOTH)
         after, slopes = self._with_slopes(self._after, u)
         moves = np.eye(19)
         moves[:11, :11], moves[:11, 16:] = slopes[:, :11], slopes[:, 11:]
@@ -319,17 +329,6 @@ class _DisturbanceFilter(SensorFilter):
         moved = [np.array(function(x, force + step * unit)[0])[:, 0] for unit in np.eye(3)]
         by_force = (np.stack(moved, axis=1) - np.array(value)) / step
         return np.array(value), np.hstack([np.array(slopes), by_force])
-
-    def _correct(self, seen: np.ndarray, expected: Any, slopes: Any) -> None:
-        if len(self._z) == 14:  # the first readings, of wheels that are not driven
-            super()._correct(seen, expected, slopes)
-            return
-        turned = np.repeat([1.0, self._dt], (6, 3))
-        missed = np.asarray(seen[:9], np.float64) * Sensors.SCALE - self._bias - turned * expected[:, 0]
-        missed -= self._of_biases @ self._z[11:16]
-        slopes = turned[:, None] * slopes
-        h = np.hstack([slopes[:, :11], self._of_biases, slopes[:, 11:]])
-        self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
 
 
 class StateFromSensors(gymnasium.Wrapper):

@@ -57,10 +57,7 @@ class Suspect(NamedTuple):
         suspicions = [_Suspicion((), 1.0), *_suspicions(columns)]
         factors = np.array([[each.factor if name in each.names else 1.0 for name in columns] for each in suspicions])
         misfit = _misfits(problem, part, factors, _LOOSER)
-        scores = -0.5 * misfit.sum(axis=(0, 2))
-        m = len(readings.names)
-        scores += np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
-        gains = scores - scores[0]
+        gains = _gains(part, factors, misfit)
         best = int(np.argmax(gains))
         if misfit[:, best].mean() > _NONSENSE:
             raise ValueError(
@@ -93,14 +90,19 @@ def _misfits(problem: Problem, part: Readings, factors: np.ndarray, looser: floa
         return np.where(fails, _MOST, np.minimum(found.missed**2 / variance, _MOST) + np.log(variance))
 
 
+def _gains(part: Readings, factors: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+    """(B,) by how much the log-likelihood of a log multiplied by factors (B, m + k) exceeds that of the first of them."""
+    changed = np.log(np.abs(factors[:, : len(part.names)])) @ np.isfinite(part.y).sum(axis=0)
+    scores = -0.5 * misfit.sum(axis=(0, 2)) + changed
+    return scores - scores[0]
+
+
 def _explained_by_drift(problem: Problem, part: Readings, factors: np.ndarray) -> bool:
     """Whether a log that is multiplied by the second factors (2, m + k) is likelier than as it is because its robot is far
     from the nominal one: where the filter trusts the nominal robot less, it is not.
     """
-    m = len(part.names)
-    misfit = _misfits(problem, part, factors, _FAR_LOOSER).sum(axis=(0, 2))
-    scores = -0.5 * misfit + np.log(np.abs(factors[:, :m])) @ np.isfinite(part.y).sum(axis=0)
-    return bool(scores[1] - scores[0] < _CLEAR * len(part.t))
+    gains = _gains(part, factors, _misfits(problem, part, factors, _FAR_LOOSER))
+    return bool(gains[1] < _CLEAR * len(part.t))
 
 
 def _suspicions(columns: tuple[str, ...]) -> Iterator[_Suspicion]:

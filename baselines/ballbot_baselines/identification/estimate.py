@@ -45,7 +45,9 @@ _MODEL_ERRORS = {
 MuJoCo, in steps of 1 and 2 ms, differ from the equations; see docs/identify.md."""
 _DELAY_ERROR = 3e-4  # s, the same of the delay
 _BLOCK = 2.0  # s
-_BEGINNING = 10.0  # s of each log, from which the search for the estimate of all begins
+_BEGINNING = (
+    10.0  # s at the start of each log; the search for the estimate of whole logs starts from that of these parts
+)
 _DELAY, _LAG = 0.03, 0.005  # s; a lag below 0 has no meaning, but a search needs no end there
 _BIASES = {"lean": 0.03, "lean_rate": 0.02, "gyro": 0.02, "accel": 0.2}  # rad, rad/s, rad/s, m/s²
 _NOISES = {
@@ -215,13 +217,9 @@ class Problem:
         with np.errstate(all="ignore"):  # of filters that fail
             for log in logs:
                 missed, variance, first, second = self._derivatives(log, z)
-                scale = 1 / np.sqrt(variance)
                 value += 0.5 * float(np.sum(np.log(variance) + missed**2 / variance))
-                slope += np.einsum("npm,nm->p", first, missed * scale)
-                slope += 0.5 * np.einsum("npm,nm->p", second, 1 - missed**2 / variance)
-                for weight, part in ((1.0, first), (0.5, second)):
-                    flat = part.transpose(1, 0, 2).reshape(count, -1)
-                    curvature += weight * flat @ flat.T
+                slope += _slopes(missed, variance, first, second).sum(axis=0)
+                curvature += _fisher(first, second)
         if not (np.isfinite(value) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
             return np.inf, np.zeros(count), np.eye(count)
         return value, slope, curvature
@@ -239,13 +237,11 @@ class Problem:
         slopes, curvatures = [], []
         for log in logs:
             missed, variance, first, second = self._derivatives(log, z)
-            slope = np.einsum("npm,nm->np", first, missed / np.sqrt(variance))
-            slope += 0.5 * np.einsum("npm,nm->np", second, 1 - missed**2 / variance)
+            slope = _slopes(missed, variance, first, second)
             count = max(1, round((log.t[-1] - log.t[0]) / seconds))
             for own in np.array_split(np.arange(len(log.t)), count):
-                a, b = (part[own].transpose(1, 0, 2).reshape(len(z), -1) for part in (first, second))
                 slopes.append(slope[own].sum(axis=0))
-                curvatures.append(a @ a.T + 0.5 * b @ b.T)
+                curvatures.append(_fisher(first[own], second[own]))
         return np.array(slopes), np.array(curvatures)
 
     def most_likely(self, logs: list[Readings], watch: Callable[[int], object] = lambda done: None) -> "Found":
@@ -370,6 +366,18 @@ def _minimum(
         callback=end_near,
     )  # fmt: skip
     return found.x, at(found.x)[2] - np.eye(len(start)), rounds + len(known)
+
+
+def _slopes(missed: np.ndarray, variance: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(n, p) the part of each time in the slope of the likelihood, by what `Problem._derivatives` returns."""
+    slopes = np.einsum("npm,nm->np", first, missed / np.sqrt(variance))
+    return slopes + 0.5 * np.einsum("npm,nm->np", second, 1 - missed**2 / variance)
+
+
+def _fisher(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(p, p) Fisher information of readings whose ν'/√S and S'/S are these (n, p, m)."""
+    a, b = (part.transpose(1, 0, 2).reshape(part.shape[1], -1) for part in (first, second))
+    return a @ a.T + 0.5 * b @ b.T
 
 
 def _widening(slopes: np.ndarray, curvatures: np.ndarray) -> np.ndarray:

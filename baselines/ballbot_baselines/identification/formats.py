@@ -103,12 +103,12 @@ def _parquet(path: Path) -> dict[str, Any]:
 def _kugle(path: Path) -> dict[str, Any]:
     """The columns of a dump of Kugle, of the file about its sensors if there is one, and the leans of its quaternions."""
     table = _dump(path, _KUGLE)
-    beside = path.parent / "sensor" / path.name
-    if beside.exists():
-        sensed = _dump(beside, _KUGLE_SENSORS)
+    of_sensors = path.parent / "sensor" / path.name
+    if of_sensors.exists():
+        sensed = _dump(of_sensors, _KUGLE_SENSORS)
         _, own, other = np.intersect1d(table["time"], sensed["time"], return_indices=True)
         if len(own) < min(len(table["time"]), len(sensed["time"])) / 2:
-            raise LogError(f"{path} and {beside} have other times, so they are not of the same dump")
+            raise LogError(f"{path} and {of_sensors} have other times, so they are not of the same dump")
         table = {name: column[own] for name, column in table.items()}
         table |= {name: column[other] for name, column in sensed.items() if name != "time"}
     for prefix in ("", "mti_"):

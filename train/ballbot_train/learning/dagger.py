@@ -21,7 +21,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,31 +71,14 @@ class DaggerConfig(Settings):
     """What the actor keeps of the task's symmetry."""
 
 
+# few samples suffice that label the states around them too
+_FEW = DaggerConfig(iterations=20, evaluations=5, batch_size=256, learning_rate=1e-2, hidden=(64, 64))
 TUNED: dict[str, DaggerConfig] = {
     "": DaggerConfig(),
-    # few samples suffice that label the states around them too, as on Orbit
-    "stabilize": DaggerConfig(
-        iterations=20,
-        gathering_iterations=2,
-        evaluations=5,
-        gradient_steps=400,
-        batch_size=256,
-        learning_rate=1e-2,
-        hidden=(64, 64),
-        symmetry="odd",
-    ),
+    "stabilize": replace(_FEW, gathering_iterations=2, gradient_steps=400, symmetry="odd"),
     "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
     # plans at the force limit leave no force for corrections
-    "orbit": DaggerConfig(
-        iterations=20,
-        gathering_iterations=3,
-        evaluations=5,
-        batch_size=256,
-        learning_rate=1e-2,
-        hidden=(64, 64),
-        symmetry="centred",
-        backoff=Backoff(force=0.06, grip=EXECUTED.grip),
-    ),
+    "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred", backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
     "weave": DaggerConfig(
         symmetry="routes", hidden=(256, 256), backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip)
     ),
