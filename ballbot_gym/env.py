@@ -5,7 +5,7 @@ import math
 import sys
 from collections.abc import Sequence
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -19,9 +19,7 @@ from ballbot_gym.checks import (
     real_array,
     reset_options,
 )
-from ballbot_gym.drawing import Drawing, Drawn
-from ballbot_gym.drawing.picture import picture
-from ballbot_gym.drawing.viewer import Viewer
+from ballbot_gym.drawing import Drawing, Drawn, can_view, need_viewer
 from ballbot_gym.engines import State, checked_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.machine_code.single import StepCode, StepProblem
@@ -53,6 +51,9 @@ from ballbot_gym.step import (
     step,
 )
 from ballbot_gym.tasks import TASKS, Task
+
+if TYPE_CHECKING:
+    from ballbot_gym.drawing.viewer import Viewer
 
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
@@ -199,17 +200,17 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             ImportError: physics="bullet" without a usable PyBullet, "mujoco" without MuJoCo, or render_mode="human" without
                 the extra "play".
         """
-        self._page: Viewer | None = None
+        self._page: "Viewer | None" = None
         self._now: StepState | None = None  # until the first reset
         self.params = robot_of(task, robot, params)
         self.physics = physics = checked_physics(physics, self.params)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         if render_mode == "human":
-            Viewer.need_library()
+            need_viewer()
         self.task = make_task(task, self.params, **task_fields)
         self.render_mode = render_mode
-        modes, fps = ["human", "rgb_array"] if Viewer.is_possible() else ["rgb_array"], round(1 / self.task.control_dt)
+        modes, fps = ["human", "rgb_array"] if can_view() else ["rgb_array"], round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
         dt = self.task.control_dt
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
@@ -352,8 +353,12 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         markers = tuple(self.task.markers(self._constants))
         drawing = Drawing(self.params, (Drawn(np.array(self._now.x)),), markers=markers)
         if self.render_mode == "rgb_array":
+            from ballbot_gym.drawing.picture import picture  # here and below, because most environments draw nothing
+
             return picture(drawing)
         if self._page is None:
+            from ballbot_gym.drawing.viewer import Viewer
+
             self._page = Viewer()
             sys.stderr.write(f"the robot is shown at {self._page.address}\n")
         self._page.show(drawing, self.task.control_dt)

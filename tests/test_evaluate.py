@@ -185,12 +185,13 @@ IMPORTS = [
     ("import ballbot_train.evaluation.runner, ballbot_train.evaluation.comparison", []),
     ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
     ("from ballbot_train import evaluate, shipped_policies", []),
-    ("evaluate(Idle(), 'stabilize', 1, 'rk4')", ["casadi"]),  # it prints the C of the environment
+    ("evaluate(Idle(), 'stabilize', 1, 'rk4')", ["casadi"]),  # it prints the C of the environment, which is in no cache yet
     ("import ballbot_train.learning.demonstrations", ["casadi", "scipy"]),
 ]
 
 
-def test_an_import_loads_only_what_it_needs():
+def test_an_import_loads_only_what_it_needs(monkeypatch, tmp_path):
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
     code = "import sys\nclass Idle:\n    reset = act = lambda *given: (0.0, 0.0)\n"
     heavy = "torch", "casadi", "scipy", "stable_baselines3", "tyro", "matplotlib"
     code += "".join(f"{line}\nprint(sorted(set({heavy}) & set(sys.modules)))\n" for line, _ in IMPORTS)

@@ -1,5 +1,7 @@
 """Machine code of single environments computes what Python computes, to rounding, and the same bits every time."""
 
+import subprocess
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -214,3 +216,40 @@ def test_sensors_of_machine_code_read_the_robots_numbers():
     robot = named_robot("omni")
     env: Any = BallbotEnv("stabilize", "rk4", robot=robot, observation="sensors")
     assert env.step_problem.numbers(robot)[-1] == robot.com_height
+
+
+STEPPED = """
+import sys
+
+import gymnasium
+import numpy as np
+
+import ballbot_gym
+
+
+class Own(ballbot_gym.Stabilize):
+    pass
+
+
+fields = {"shipped": {}, "other": {"heading_weight": 1.0, "effort_weight": 1e-2}, "own": {"task": Own()}}
+env = gymnasium.make("BallbotStabilize-v0", physics="rk4", **fields[sys.argv[1]])
+env.reset(seed=0)
+print(env.step(np.full(2, 0.3, np.float32))[1], "casadi" in sys.modules)
+"""
+
+
+@needs_compiler
+def test_code_of_this_package_is_printed_once_on_a_machine_and_that_of_users_by_each_process(monkeypatch, tmp_path):
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "cache"))
+
+    def reward_and_print(which: str) -> list[str]:
+        command = [sys.executable, "-c", STEPPED, which]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+    reward, printed = reward_and_print("shipped")
+    assert printed == "True"
+    assert reward_and_print("shipped") == [reward, "False"]
+    other, printed = reward_and_print("other")
+    assert printed == "True"
+    assert other != reward
+    assert [reward_and_print("own") for _ in range(2)] == [[reward, "True"]] * 2

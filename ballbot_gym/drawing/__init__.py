@@ -6,9 +6,11 @@ depends on a graphics library.
 
 import math
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 
+from ballbot_gym import lazy
 from ballbot_gym.robot import Ballbot, Robot
 from ballbot_gym.robot.shapes import DARK
 from ballbot_gym.tasks.marker import Marker
@@ -30,6 +32,7 @@ PUSH_SCALE = 1 / 130
 """Length of a push's arrow, m/(N·s)."""
 LEAST_FORCE = 2.0
 """N: smaller forces get no arrow."""
+_SERVER = "websockets"
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,16 @@ class Drawing:
             for color, part, scale, least, at in drawn
             if part is not None and len(part) == 2 and math.hypot(*part) > least
         ]
+
+
+def can_view() -> bool:
+    """Whether the library that serves the page in the browser is installed."""
+    return find_spec(_SERVER) is not None
+
+
+def need_viewer() -> None:
+    """Raises an ImportError that says what to do where that library is missing."""
+    lazy.need('the page of render_mode="human" and of `ballbot play`', _SERVER, extra="play")
 
 
 def _ring(marker: Marker) -> np.ndarray:

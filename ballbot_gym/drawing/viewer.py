@@ -16,11 +16,9 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any
 
-from ballbot_gym import lazy
-from ballbot_gym.drawing import Drawing
+from ballbot_gym.drawing import Drawing, need_viewer
 from ballbot_gym.drawing.page import look, moment, page_html
 from ballbot_gym.robot import default_params
 
@@ -54,7 +52,7 @@ class Viewer:
             ValueError: no such port.
             OSError: neither the port nor one of the next hundred is free.
         """
-        self.need_library()
+        need_viewer()
         if not 0 <= port < 2**16:
             raise ValueError(f"port must be 0 to {2**16 - 1}, not {port}")
         data = f"const DATA = {json.dumps(look(default_params()))};"
@@ -70,16 +68,6 @@ class Viewer:
         self._stopped = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
-
-    @staticmethod
-    def is_possible() -> bool:
-        """Whether the library that serves the page is installed."""
-        return find_spec("websockets") is not None
-
-    @staticmethod
-    def need_library() -> None:
-        """Raises an ImportError that says what to do where the library is missing."""
-        lazy.need('the page of render_mode="human" and of `ballbot play`', "websockets", extra="play")
 
     @property
     def address(self) -> str:

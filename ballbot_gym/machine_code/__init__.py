@@ -12,6 +12,7 @@ from ballbot_gym.machine_code.libraries import (
     check_private,
     compiler,
     library,
+    printed,
     shipped_source,
 )
 
@@ -24,5 +25,6 @@ __all__ = [
     "check_private",
     "compiler",
     "library",
+    "printed",
     "shipped_source",
 ]

@@ -4,6 +4,8 @@ Sometimes that is impossible: there is no C compiler, the compiler fails or hang
 cannot be written or is not the user's own. Wheels of some systems contain libraries that were compiled before, in `SHIPPED`.
 """
 
+import contextlib
+import dataclasses
 import hashlib
 import logging
 import os
@@ -13,9 +15,13 @@ import stat
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
+
+from ballbot_gym import files
 
 _log = logging.getLogger(__name__)
 _WINDOWS = sys.platform == "win32"
@@ -27,6 +33,8 @@ _DIGITS = 24  # of SHA-256, in the names of libraries
 _COMPILE_SECONDS = 120.0  # after which a compiler counts as hanging
 _VERSION_SECONDS = 10.0
 _WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+_PACKAGE = Path(__file__).parents[1]
 
 SHIPPED = Path(__file__).with_name("compiled")
 """The libraries that a wheel contains, in a folder for each of `LEVELS`."""
@@ -126,6 +134,50 @@ def library(name: str, source: str, flags: tuple[str, ...] = ("-O2",)) -> Path:
     except (OSError, RuntimeError) as error:
         # a program that cannot be run, no home, or a folder that cannot be written
         raise NoMachineCodeError(str(error)[-300:]) from error
+
+
+def printed(name: str, problem: tuple[Any, ...], kinds: tuple[type, ...], source: Callable[[], str]) -> str:
+    """The C code that `source` prints.
+
+    For tasks and robots of this package it is kept in the cache, because CasADi prints it, whose import takes longer than a
+    hundred control steps. Those of users may change in ways that cannot be seen without printing.
+
+    Args:
+        name: what the code is called, for humans who look into the cache.
+        problem: everything that determines the code, besides the files of this package. Of dataclasses, all fields count.
+        kinds: the classes of task and robot.
+        source: prints the code; it may raise any error.
+    """
+    if not all(kind.__module__.startswith(f"{_PACKAGE.name}.") for kind in kinds):
+        return source()
+    content = [_fields(part) if dataclasses.is_dataclass(part) else repr(part) for part in problem]
+    key = hashlib.sha256("\0".join([_state_of_package(), *content]).encode()).hexdigest()[:_DIGITS]
+    try:
+        path = cache_folder() / f"{name}-{key}.c"
+        if path.is_file():
+            check_private(path.parent, "BALLBOT_CACHE")
+            check_private(path, "BALLBOT_CACHE")
+            return path.read_text(encoding="utf-8")
+    except (OSError, RuntimeError, UnicodeDecodeError):  # `library` says what is wrong with the folder
+        return source()
+    code = source()
+    with contextlib.suppress(OSError):
+        _make_private(path.parent)
+        files.write(path, code)
+    return code
+
+
+def _fields(part: Any) -> str:
+    """A dataclass and all its fields, those too that its repr leaves out."""
+    return repr((type(part), [(field.name, getattr(part, field.name)) for field in dataclasses.fields(part)]))
+
+
+@cache
+def _state_of_package() -> str:
+    """When the files of this package were written last, ns, and how long they are."""
+    found = (path for path in _PACKAGE.rglob("*") if path.suffix in (".py", ".c", ".h"))
+    states = ((path, path.stat()) for path in sorted(found))
+    return "\0".join(f"{path} {state.st_mtime_ns} {state.st_size}" for path, state in states)
 
 
 def cache_folder() -> Path:

@@ -237,8 +237,9 @@ def _function(problem: StepProblem, robot: Robot) -> Callable[..., None]:
         Exception: any error of a task that cannot compute with symbols.
     """
     source = shipped_source(problem.code_name(robot)) if find_spec("casadi") is None else None
-    source = problem.source() if source is None else source
-    path = machine_code.library(f"one-{type(problem.task).__name__.lower()}", source, FLAGS)
+    name, kinds = f"one-{type(problem.task).__name__.lower()}", (type(problem.task), problem.kind.robot)
+    source = machine_code.printed(name, problem, kinds, problem.source) if source is None else source
+    path = machine_code.library(name, source, FLAGS)
     function = ctypes.PyDLL(str(path)).compute  # it keeps the GIL: it is short
     function.argtypes, function.restype = (ctypes.c_void_p,), None
     _check(problem, function, robot)

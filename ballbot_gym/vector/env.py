@@ -23,7 +23,6 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.drawing import Drawing, Drawn
-from ballbot_gym.drawing.picture import picture
 from ballbot_gym.env import TaskEnv, make_task, robot_of
 from ballbot_gym.lazy import missing
 from ballbot_gym.machine_code import NoMachineCodeError
@@ -246,6 +245,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the envs with render_mode="rgb_array"')
             return None
+        from ballbot_gym.drawing.picture import picture  # here, because most environments draw nothing
+
         states, constants = (np.array(part.T.tolist()) for part in (self._state.x, self._state.c))
         return tuple(
             picture(Drawing(self.params, (Drawn(x),), markers=tuple(self.task.markers(c))))

@@ -181,9 +181,14 @@ def _source(task: Task, params: Robot, double: bool) -> str:
     """
     if find_spec("casadi") is None and (written := machine_code.shipped_source(code_name(task, params, double))):
         return written
-    from ballbot_gym.machine_code import codegen  # it imports CasADi
 
-    return codegen.source(task, params, double)
+    def print_it() -> str:
+        from ballbot_gym.machine_code import codegen  # it imports CasADi
+
+        return codegen.source(task, params, double)
+
+    kinds = type(task), type(params)
+    return machine_code.printed(type(task).__name__.lower(), (task, params, double), kinds, print_it)
 
 
 def code_name(task: Task, params: Robot, double: bool) -> str:

@@ -3,6 +3,7 @@
 import signal
 from typing import Literal
 
+from ballbot_gym.drawing import need_viewer
 from ballbot_gym.drawing.viewer import PORT, Viewer
 from ballbot_gym.env import make_task
 from ballbot_gym.registry import own_robot
@@ -47,7 +48,7 @@ def play(
             f"the page draws ballbots, and {task} is a task of a {type(params).__name__}; to see its episodes: "
             f"ballbot replay {task} --controllers NAME"
         )
-    Viewer.need_library()
+    need_viewer()
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
     console.print("preparing the controllers …")
