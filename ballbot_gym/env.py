@@ -36,7 +36,6 @@ from ballbot_gym.robot import (
 from ballbot_gym.step import (
     ENGINE,
     Draws,
-    Outcome,
     Step,
     StepState,
     applied,
@@ -49,15 +48,14 @@ from ballbot_gym.step import (
     start,
     start_draws,
     step,
+    unmoved,
 )
 from ballbot_gym.tasks import TASKS, Task
 
 if TYPE_CHECKING:
     from ballbot_gym.drawing.viewer import Viewer
 
-_NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
-_NOTHING_DONE = Outcome(*(0.0,) * 9, violated=-1.0)
 
 
 class EnvState(NamedTuple):
@@ -259,15 +257,19 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         state, constants, *drawn = reset_options(options, "state", "constants", *draws)
         now = self._started(state, constants, drawn[0] if drawn else None)
         self._begin(now)
+        z = tuple(self.np_random.random(len(self._draws.noise)).tolist()) if self._random else ()
+        if self._code is None:
+            made, measured, seen, x, force = self._shown(unmoved(self.task, self.params, now), z)
+        else:
+            made, measured = self._code.start(now, z)
+            seen, x, force = self._code.seen.astype(_FLOAT32), np.array(now.x), self._code.force.copy()
+        self._steps_left = 0
+        self._check_start(made)
         self._steps_left = self.task.steps
         if self._human:
             self.render()
-        z = tuple(self.np_random.random(len(self._draws.noise)).tolist()) if self._random else ()
-        seen = observe(self.task, self.params, self.randomization, now, z)
-        grip = _NO_GRIP if self.params.grips else ()
-        begun = Step(now, _NOTHING_DONE, (0.0,) * self.params.action_size, 0.0, grip)
-        arrays = np.array(now.x), np.array(begun.force)
-        return self._with_past(np.array(seen, np.float32)), self._info(begun, self.params.measurements(now.x), *arrays)
+        info = self._info(made, measured, x, force)
+        return self._with_past(seen), info
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -286,8 +288,17 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended; call reset()" if self._now else "step() before reset()"
             )
-        parts = self._checked(action)
-        made, measured, seen, x, force = self._advance(parts)
+        parts, z, code = self._checked(action), self._draws, self._code
+        if self._random:
+            z = _split(self.np_random, z)
+        now = self._now
+        assert now is not None
+        moved = self._simulated(now, parts, z) if self._engine else None
+        if code is None:
+            made, measured, seen, x, force = self._interpreted(now, parts, z, moved)
+        else:
+            made, measured = code.step(now, parts, z, moved)
+            seen, x, force = code.seen.astype(_FLOAT32), code.x.copy(), code.force.copy()
         self._now, did = made.state, made.outcome
         self._steps_left -= 1
         terminated = did.terminated > 0
@@ -296,24 +307,37 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if self._human:
             self.render()
         info = self._info(made, measured, x, force)
-        return self._with_past(seen, parts), did.reward, terminated, did.truncated > 0, info
+        if self._past.size:
+            seen = self._with_past(seen, parts)
+        return seen, did.reward, terminated, did.truncated > 0, info
 
-    def _advance(self, action: tuple[float, ...]) -> tuple[Step, State, np.ndarray, np.ndarray, np.ndarray]:
-        """A control step, and measurements, (no,) float32 observation, state and force after it."""
-        assert self._now is not None
-        task, now, code, z = self.task, self._now, self._code, self._draws
-        if self._random:
-            z = _split(self.np_random, z)
-        moved = self._simulated(now, action, z) if self._engine else None
-        if code is not None:
-            made, measured = code.step(now, action, z, moved)
-            return made, measured, code.seen.astype(_FLOAT32), code.x.copy(), code.force.copy()
-        dt = task.control_dt
+    def _interpreted(
+        self, now: StepState, action: tuple[float, ...], z: Draws, moved: tuple[State, tuple[float, ...], float] | None
+    ) -> tuple[Step, State, np.ndarray, np.ndarray, np.ndarray]:
+        """A control step in Python, and what `_shown` says of it."""
+        dt = self.task.control_dt
         move = by_engine(*moved, dt) if moved else closed_form(dt, self._substeps)
-        made = step(task, self.params, self.randomization, now, action, z, move, self._robot)
+        made = step(self.task, self.params, self.randomization, now, action, z, move, self._robot)
+        return self._shown(made, z.noise)
+
+    def _shown(self, made: Step, noise: tuple[float, ...]) -> tuple[Step, State, np.ndarray, np.ndarray, np.ndarray]:
+        """A step, and measurements, (no,) float32 observation, state and force after it."""
         after = made.state
-        seen = np.array(observe(task, self.params, self.randomization, after, z.noise), np.float32)
+        seen = np.array(observe(self.task, self.params, self.randomization, after, noise), np.float32)
         return made, self.params.measurements(after.x), seen, np.array(after.x), np.array(made.force)
+
+    def _check_start(self, made: Step) -> None:
+        """Raises a ValueError if an episode would start out of range."""
+        if made.outcome.violated < 0:
+            return
+        params, x = self.params, made.state.x
+        values = [f"{quantity.name} = {value:g}" for quantity, value in zip(params.STATE, x, strict=True)]
+        measured = zip(params.MEASUREMENTS, params.measurements(x), strict=True)
+        values += [f"{quantity.name} = {value:g} {quantity.unit}" for quantity, value in measured]
+        violated = self.limit_names[int(made.outcome.violated)]
+        raise ValueError(
+            f"{self.task.id}: the start state is out of range: it violates the limit of {violated} ({', '.join(values)})"
+        )
 
     def _simulated(self, now: StepState, action: tuple[float, ...], z: Draws) -> tuple[State, tuple[float, ...], float]:
         """The engine's control step: the state after it, the floor's force where it is simulated, and ≥ 0 if it is stable."""
@@ -442,7 +466,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             self._code.begin(now.c, now.drawn, self.params, self._robot)
 
     def _started(self, state: Any, constants: Any, drawn: Any) -> StepState:
-        """The start of an episode. What is not given is drawn. Raises a ValueError if it is out of range."""
+        """The start of an episode. What is not given is drawn. Raises a ValueError if what is given is no such thing."""
         task, params, noise = self.task, self.params, self.randomization
         z = tuple(self.np_random.random(self._start_draws).tolist())
         c = None
@@ -458,15 +482,9 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
         if drawn is not None:
             drawn = _floats(finite_array(drawn, (noise.episode_draws,), "drawn"))
         begun = start(task, params, noise, z, self._senses, x, c, drawn)
-        x, c = _floats(begun.x), _floats(begun.c)
-        begun = StepState(x, c, 0, *begun[3:])
-        if violated := task.violated(x, task.at(c, 0.0)):
-            values = [f"{quantity.name} = {value:g}" for quantity, value in zip(params.STATE, x, strict=True)]
-            measured = zip(params.MEASUREMENTS, params.measurements(x), strict=True)
-            values += [f"{quantity.name} = {value:g} {quantity.unit}" for quantity, value in measured]
-            raise ValueError(
-                f"{task.id}: the start state is out of range: it violates the limit of {violated} ({', '.join(values)})"
-            )
+        begun = StepState(_floats(begun.x), _floats(begun.c), 0, *begun[3:])
+        if x is not None or c is not None:
+            self._check_start(unmoved(task, params, begun))  # now, so that an episode goes on after such a mistake
         return begun
 
     def _checked(self, action: Sequence[float] | np.ndarray) -> tuple[float, ...]:

@@ -69,7 +69,7 @@ def floor(a: Any) -> Any:
 def clip(a: Any, low: Any, high: Any) -> Any:
     """The nearest number in [low, high], elementwise; NaN stays NaN, but not with CasADi."""
     if isinstance(a, _NUMBERS):
-        return max(min(a, high), low)
+        return a if low <= a <= high else max(min(a, high), low)  # most numbers are in range
     library = _library(a)
     return library.fmax(library.fmin(a, high), low) if _is_casadi(a) else library.clip(a, low, high)
 

@@ -233,6 +233,14 @@ def step(
     return Step(after, did, force, largest > 1.0, grip)
 
 
+def unmoved(task: Task, robot: Any, state: StepState) -> Step:
+    """As `step` returns it, where an episode starts: nothing is applied, paid or ended, but a limit may be violated."""
+    x, zero = state.x, ops.full_like(state.x[0], 0.0)
+    violated = first_violated(task.limits(x, task.at(state.c, state.steps * task.control_dt)), like=x)
+    grip = (zero,) * (4 if robot.grips else 0)
+    return Step(state, Outcome(*(zero,) * 9, violated=violated), (zero,) * robot.action_size, zero, grip)
+
+
 def start_draws(task: Task, variation: Randomization, senses: bool) -> int:
     """Uniform numbers that `start` takes."""
     varied = variation.episode_draws * variation.active

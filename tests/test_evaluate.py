@@ -185,7 +185,10 @@ IMPORTS = [
     ("import ballbot_train.evaluation.runner, ballbot_train.evaluation.comparison", []),
     ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
     ("from ballbot_train import evaluate, shipped_policies", []),
-    ("evaluate(Idle(), 'stabilize', 1, 'rk4')", ["casadi"]),  # it prints the C of the environment, which is in no cache yet
+    (
+        "evaluate(Idle(), 'stabilize', 1, 'rk4')",
+        ["casadi"],
+    ),  # it prints the C of the environment, which is in no cache yet
     ("import ballbot_train.learning.demonstrations", ["casadi", "scipy"]),
 ]
 

@@ -164,7 +164,7 @@ class Converting(Stabilize):
 def test_code_that_computes_something_else_than_python_is_refused():
     env: Any = BallbotEnv(Converting(), "rk4")
     with pytest.raises(machine_code.NoMachineCodeError, match="gives other results"):
-        single._function(env.step_problem, env.params)
+        single._compiled(env.step_problem, env.params)
     env.reset()
     assert env._code is None
 
@@ -185,7 +185,7 @@ class Everything(Stabilize):
 @needs_compiler
 def test_whatever_ops_computes_is_computed_alike_in_machine_code():
     env: Any = BallbotEnv(Everything(), "rk4")
-    assert single._function(env.step_problem, env.params)  # it compares
+    assert single._compiled(env.step_problem, env.params)  # it compares
 
 
 @needs_compiler

@@ -112,40 +112,38 @@ def source(task: Task, params: Robot, double: bool) -> str:
     return "\n".join([*defined, text("real.h"), text("native.c"), *blocks])
 
 
-def single_source(
-    arguments: Mapping[str, int], compute: Callable[[dict[str, Any]], Mapping[str, Sequence[Any]]]
-) -> str:
-    """The C code `void compute(double *numbers)` of a function from named numbers to named numbers, as that of a step.
+Function = Callable[[dict[str, Any]], Mapping[str, Sequence[Any]]]
+"""From arguments by name to results by name."""
+
+
+def single_source(arguments: Mapping[str, int], functions: Mapping[str, Function]) -> str:
+    """The C code `void NAME(double *numbers)` of functions of the same named numbers, as of a step.
 
     The numbers are the results, then the arguments.
 
     Args:
         arguments: their names, and how many numbers each has.
-        compute: from arguments by name to results by name.
+        functions: by name; their results have the same names and sizes.
 
     Raises:
         Exception: as `source`.
     """
     given = {name: _symbols(f"{name}_", size) for name, size in arguments.items()}
-    results = compute(given)
-    count, pointers, at = len(results), [], 0
-    for part in (*results.values(), *given.values()):
-        pointers.append(f"numbers + {at}, 1")
-        at += len(part)
-    code = block(
-        "one",
-        [(f"given_{name}", part) for name, part in given.items()],
-        [(f"made_{name}", part) for name, part in results.items()],
-    )
-    called = ", ".join((*pointers[count:], *pointers[:count]))
-    return "\n".join(
-        [
-            "#define DOUBLE 1\n#define LANES 1",
-            text("real.h"),
-            code,
-            f"void compute(double *numbers) {{\n    one({called});\n}}\n",
+    blocks = []
+    for function, compute in functions.items():
+        results = compute(given)
+        count, pointers, at = len(results), [], 0
+        for part in (*results.values(), *given.values()):
+            pointers.append(f"numbers + {at}, 1")
+            at += len(part)
+        inputs = [(f"given_{name}", part) for name, part in given.items()]
+        outputs = [(f"made_{name}", part) for name, part in results.items()]
+        called = ", ".join((*pointers[count:], *pointers[:count]))
+        blocks += [
+            block(f"one_{function}", inputs, outputs),
+            f"void {function}(double *numbers) {{\n    one_{function}({called});\n}}\n",
         ]
-    )
+    return "\n".join(["#define DOUBLE 1\n#define LANES 1", text("real.h"), *blocks])
 
 
 _TRANSPOSE = """

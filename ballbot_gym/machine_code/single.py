@@ -18,7 +18,18 @@ import numpy as np
 from ballbot_gym import machine_code
 from ballbot_gym.machine_code.libraries import NoMachineCodeError, shipped_source
 from ballbot_gym.robot import Kind, Randomization, Robot, Sensors, first_of_kind, named_robot
-from ballbot_gym.step import Draws, Outcome, Step, StepState, by_engine, closed_form, observation_size, observe, step
+from ballbot_gym.step import (
+    Draws,
+    Outcome,
+    Step,
+    StepState,
+    by_engine,
+    closed_form,
+    observation_size,
+    observe,
+    step,
+    unmoved,
+)
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import digest, problem_digest
 
@@ -27,6 +38,8 @@ _log = logging.getLogger(__name__)
 FLAGS = ("-O1", "-fno-math-errno", "-fno-trapping-math")
 
 _TRIALS = 4
+_BY_ENGINE = ("end", "floor", "stable")
+"""Arguments that an engine gives."""
 _new = tuple.__new__  # of a named tuple, several times as fast as `_make`, which also counts the numbers
 
 Numbers = tuple[Any, ...]
@@ -94,20 +107,29 @@ class StepProblem(NamedTuple):
             "seen": observation_size(self.task, kind, "sensors" if self.senses else "state"),
         }
 
-    def computed(self, given: Mapping[str, Numbers]) -> dict[str, Numbers]:
-        """The results that follow from arguments: numbers, or symbols from which the code is printed."""
+    def stepped(self, given: Mapping[str, Numbers]) -> dict[str, Numbers]:
+        """The results of a step that follow from arguments: numbers, or symbols from which the code is printed."""
         task, dt = self.task, self.task.control_dt
-        robot = self._robot(given["robot"])
+        robot, state, z = self._read(given)
         model = self._robot(given["model"]) if self.variation.varies_robot else robot
-        state = StepState(
-            given["x"], given["c"], given["steps"][0], given["drawn"], given["actuator"], given["sensors"]
-        )
-        z = Draws(given["push"], given["read"], given["noise"])
         if self.substeps:
             move = closed_form(dt, self.substeps)
         else:
             move = by_engine(given["end"], given["floor"], given["stable"][0], dt)
-        made = step(task, robot, self.variation, state, given["action"], z, move, model)
+        return self._written(robot, step(task, robot, self.variation, state, given["action"], z, move, model), z)
+
+    def started(self, given: Mapping[str, Numbers]) -> dict[str, Numbers]:
+        """The same where an episode starts in the state, and nothing was done."""
+        robot, state, z = self._read(given)
+        return self._written(robot, unmoved(self.task, robot, state), z)
+
+    def _read(self, given: Mapping[str, Numbers]) -> tuple[Any, StepState, Draws]:
+        state = StepState(
+            given["x"], given["c"], given["steps"][0], given["drawn"], given["actuator"], given["sensors"]
+        )
+        return self._robot(given["robot"]), state, Draws(given["push"], given["read"], given["noise"])
+
+    def _written(self, robot: Any, made: Step, z: Draws) -> dict[str, Numbers]:
         after = made.state
         return {
             "outcome": made.outcome,
@@ -118,8 +140,13 @@ class StepProblem(NamedTuple):
             "force": made.force,
             "grip": made.grip,
             "measured": robot.measurements(after.x),
-            "seen": observe(task, robot, self.variation, after, z.noise),
+            "seen": observe(self.task, robot, self.variation, after, z.noise),
         }
+
+    @property
+    def functions(self) -> dict[str, Callable[[Mapping[str, Numbers]], dict[str, Numbers]]]:
+        """What the code computes, by the names of its functions."""
+        return {"stepped": self.stepped, "started": self.started}
 
     def code_name(self, robot: Robot) -> str:
         """What the code is called where wheels keep it; the robot is one of the kind."""
@@ -128,7 +155,7 @@ class StepProblem(NamedTuple):
         return f"one-{type(task).__name__.lower()}-{digest(problem, [repr(each) for each in rest])}"
 
     def source(self) -> str:
-        """The C code of the step; its arguments are those of the step, and then those of the episode.
+        """The C code of the functions; their arguments are those of the step, and then those of the episode.
 
         Raises:
             ImportError: CasADi is missing.
@@ -136,7 +163,7 @@ class StepProblem(NamedTuple):
         """
         from ballbot_gym.machine_code import codegen  # it imports CasADi
 
-        return codegen.single_source(self.of_step() | self.of_episode(), self.computed)
+        return codegen.single_source(self.of_step() | self.of_episode(), self.functions)
 
     def numbers(self, robot: Robot) -> list[float]:
         """A robot's numbers, as the code takes them."""
@@ -158,7 +185,7 @@ class StepCode:
     all float64. The next step overwrites them.
     """
 
-    def __init__(self, problem: StepProblem, function: Any):
+    def __init__(self, problem: StepProblem, functions: "Functions"):
         self._problem = problem
         self._nominal: Robot | None = None
         self._numbers: list[float] = []
@@ -168,7 +195,10 @@ class StepCode:
         numbers = np.frombuffer(memory)
         self._fixed = numbers[count + arguments :]
         self._pack = partial(struct.Struct(f"{arguments}d").pack_into, memory, 8 * count)
-        self._call = partial(function, ctypes.c_void_p(numbers.ctypes.data))
+        self._step, self._start = (
+            partial(functions[name], ctypes.c_void_p(numbers.ctypes.data)) for name in problem.functions
+        )
+        self._no_step = ((0.0,) * given["action"], *problem.draws()[:2], *((0.0,) * given[name] for name in _BY_ENGINE))
         self._unpack = struct.Struct(f"{count - results['seen']}d").unpack_from
         self._memory, self.seen = memory, numbers[count - results["seen"] : count]
         ends = np.cumsum(list(results.values())).tolist()
@@ -184,14 +214,14 @@ class StepCode:
         try:
             if problem not in _functions:
                 _functions[problem] = None
-                _functions[problem] = _function(problem, robot)
-            function = _functions[problem]
+                _functions[problem] = _compiled(problem, robot)
+            functions = _functions[problem]
         except (
             Exception
         ) as error:  # no compiler, cache, CasADi or hash of the task, or any error of users' code given a symbol
             _log.info("%s stays in Python: %s: %s", problem.task.id, type(error).__name__, error)
             return None
-        return None if function is None else cls(problem, function)
+        return None if functions is None else cls(problem, functions)
 
     def begin(self, c: Numbers, drawn: Numbers, robot: Robot, model: Robot) -> None:
         """Takes what stays the same during an episode: constants, draws, the nominal robot and that of the episode."""
@@ -212,24 +242,46 @@ class StepCode:
             z: uniform numbers.
             moved: where an engine moves the robot, the first three arguments of `by_engine`.
         """
-        x, c, steps, drawn, actuator, read = state
+        x, _, steps, _, actuator, read = state
         if moved is None:
             self._pack(*x, steps, *actuator, *read, *action, *z[0], *z[1], *z[2])
         else:
             end, floor, stable = moved
             self._pack(*x, steps, *actuator, *read, *action, *z[0], *z[1], *z[2], *end, *floor, stable)
-        self._call()
+        self._step()
+        return self._made(state, steps + 1)
+
+    def start(self, state: StepState, noise: Numbers) -> tuple[Step, Numbers]:
+        """The start of an episode, and what the robot measures there; see `ballbot_gym.step.unmoved`.
+
+        Args:
+            state: in which it starts.
+            noise: uniform numbers of the observation.
+        """
+        action, push, read, end, floor, stable = self._no_step
+        self._pack(
+            *state.x, state.steps, *state.actuator, *state.sensors, *action, *push, *read, *noise, *end, *floor, *stable
+        )
+        self._start()
+        return self._made(state, state.steps)
+
+    def _made(self, before: StepState, steps: int) -> tuple[Step, Numbers]:
+        """The results, after a step that began in a state, or none."""
         v = self._unpack(self._memory)
         did, clipped, end, after, later, force, grip, measured, _ = self._slices
-        end = _new(StepState, (v[end], c, steps + 1, drawn, v[after] if actuator else (), v[later] if read else ()))
+        _, c, _, drawn, actuator, read = before
+        end = _new(StepState, (v[end], c, steps, drawn, v[after] if actuator else (), v[later] if read else ()))
         return _new(Step, (end, _new(Outcome, v[did]), v[force], v[clipped.start], v[grip])), v[measured]
 
 
-_functions: dict[StepProblem, Callable[..., None] | None] = {}
+Functions = dict[str, Callable[..., None]]
+"""Compiled `StepProblem.functions`."""
+
+_functions: dict[StepProblem, Functions | None] = {}
 
 
-def _function(problem: StepProblem, robot: Robot) -> Callable[..., None]:
-    """The compiled function.
+def _compiled(problem: StepProblem, robot: Robot) -> Functions:
+    """The compiled functions of a problem.
 
     Raises:
         NoMachineCodeError: there is no compiler, or the code computes something else than Python.
@@ -240,24 +292,26 @@ def _function(problem: StepProblem, robot: Robot) -> Callable[..., None]:
     name, kinds = f"one-{type(problem.task).__name__.lower()}", (type(problem.task), problem.kind.robot)
     source = machine_code.printed(name, problem, kinds, problem.source) if source is None else source
     path = machine_code.library(name, source, FLAGS)
-    function = ctypes.PyDLL(str(path)).compute  # it keeps the GIL: it is short
-    function.argtypes, function.restype = (ctypes.c_void_p,), None
-    _check(problem, function, robot)
-    return function
+    library, functions = ctypes.PyDLL(str(path)), {}  # it keeps the GIL: functions are short
+    for name in problem.functions:
+        functions[name] = function = getattr(library, name)
+        function.argtypes, function.restype = (ctypes.c_void_p,), None
+    _check(problem, functions, robot)
+    return functions
 
 
-def _check(problem: StepProblem, function: Callable[..., None], robot: Robot) -> None:
+def _check(problem: StepProblem, functions: Functions, robot: Robot) -> None:
     """Raises a NoMachineCodeError if code computes something else than Python, as where a symbol was taken for a number."""
     rng = np.random.default_rng(0)
     sizes = problem.of_step() | problem.of_episode()
     count = sum(problem.results().values())
     own = tuple(problem.numbers(robot))
-    for _ in range(_TRIALS):
+    for name, compute in [*problem.functions.items()] * _TRIALS:
         given = {name: tuple(rng.uniform(0.05, 0.5, size).tolist()) for name, size in sizes.items()}
         given |= {name: own for name in ("robot", "model") if sizes[name]}
-        expected = [float(part) for parts in problem.computed(given).values() for part in parts]
+        expected = [float(part) for parts in compute(given).values() for part in parts]
         numbers = np.array([0.0] * count + [part for name in sizes for part in given[name]])
-        function(ctypes.c_void_p(numbers.ctypes.data))
+        functions[name](ctypes.c_void_p(numbers.ctypes.data))
         if not np.allclose(numbers[:count], expected, rtol=1e-6, atol=1e-9, equal_nan=True):
             raise NoMachineCodeError(f"{problem.task.id} gives other results with CasADi's symbols than with numbers")
 
