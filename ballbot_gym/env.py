@@ -526,7 +526,7 @@ class BallbotEnv(TaskEnv, gymnasium.Env):
             "clipped": made.clipped > 0,
             "constants": self._constants.copy(),
         }
-        info.update(zip(self._measured, measured, strict=True))
+        info.update(zip(self._measured, measured))  # noqa: B905  strict takes time in every step
         if made.grip:
             info["grip"] = np.array(made.grip)
         if self._varies:
