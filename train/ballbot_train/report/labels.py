@@ -17,6 +17,7 @@ _CONTROLLERS = {
     "apg": ("APG", "#8e44ad"),
     "shac": ("SHAC", "#8e44ad"),
     "ppo-scratch": ("PPO from scratch", "#9acd32"),
+    "sac-scratch": ("SAC from scratch", "#7fd6e3"),
 }
 ORDER = [name for name, _ in _CONTROLLERS.values()]
 """Names as figures list them."""
