@@ -276,8 +276,9 @@ def _residual_figure(result: Identified, readings: Readings) -> Figure:
     every = max(1, len(scaled) // _DOTS)
     for axis, name, values in zip(figure.subplots(rows, 2, squeeze=False).flat, readings.names, scaled.T, strict=False):
         axis.plot(readings.t[::every], values[::every], ".", ms=2, alpha=0.5)
-        outside = np.nanmean(np.abs(values) > 1.96)
-        axis.set_title(f"{name}: {outside:.1%} beyond ±1.96, where 5 % are expected", fontsize=9)
+        read = values[np.isfinite(values)]
+        beyond = f"{np.mean(np.abs(read) > 1.96):.1%} beyond ±1.96, where 5 % are expected" if read.size else "no reading"
+        axis.set_title(f"{name}: {beyond}", fontsize=9)
         axis.set_ylim(-5, 5)
         axis.grid(alpha=0.3)
     figure.supxlabel("time, s")
