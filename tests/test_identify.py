@@ -137,6 +137,17 @@ def test_predictions_of_a_slow_log_are_of_the_next_reading_at_least(readings: Re
     assert (found.constant > 0).all()
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_log_that_is_too_short_for_a_horizon_has_no_error_there(readings: Readings) -> None:
+    problem = Problem(ROBOT, readings.names)
+    short = Predictions.of(problem, np.zeros((1, len(problem.parameters))), readings.between(0, 170))
+    assert np.isfinite(short.errors[..., :2]).all()
+    assert np.isfinite(short.constant[:, :2]).all()
+    assert np.isnan(short.errors[..., 2]).all()
+    none = Predictions.of(problem, np.zeros((1, len(problem.parameters))), readings.between(0, 90))
+    assert np.isnan(none.errors).all()
+
+
 def test_the_applied_force_is_smooth_in_the_delay_and_depends_on_no_later_command(readings: Readings) -> None:
     problem = Problem(ROBOT, readings.names)
     i, z = [each.name for each in problem.parameters].index("delay"), np.zeros((5, len(problem.parameters)))
@@ -208,6 +219,35 @@ def test_commands_that_are_glitches_are_guessed_and_their_forces_uncertain(readi
     sure, unsure = (Innovations.of(ROBOT, replace(log, guessed=each), lanes).variance for each in (None, log.guessed))
     speed = log.names.index("speed_x")
     assert unsure[802, 0, speed] > sure[802, 0, speed]
+
+
+def test_the_variance_of_guessed_commands_is_positive_and_as_much_for_every_delay(readings: Readings) -> None:
+    guessed = np.zeros_like(readings.commands)
+    guessed[200, 0], guessed[300:303, 1] = 20.0, 5.0
+    problem = Problem(ROBOT, readings.names)
+    index = {each.name: i for i, each in enumerate(problem.parameters)}
+    z = np.zeros((6, len(index)))
+    for lane, (delay, lag) in enumerate(
+        [(0, 0), (1e-4, -0.003), (-1e-4, 0.01), (0.013, -0.003), (0.02, 0), (0.025, 0)]
+    ):
+        for name, value in (("delay", delay), ("lag", lag)):
+            z[lane, index[name]] = value / problem.parameters[index[name]].spread
+    variance = problem.lanes(z).uncertain(replace(readings, guessed=guessed))
+    assert (variance >= 0).all()
+    np.testing.assert_allclose(variance.sum(axis=0), [(guessed**2).sum(axis=0)] * 6, rtol=1e-9)
+    np.testing.assert_allclose(variance[201:204, 4, 0], [400 / 6, 800 / 3, 400 / 6])  # about two steps of 10 ms later
+
+
+def test_the_search_converges_at_a_delay_of_0_where_a_command_was_guessed(recorded: Recorded) -> None:
+    """The variance of what was guessed must not be negative at a delay near 0, where the filter would fail."""
+    prompt = record(ROBOT, 12.0, randomization=replace(DRAWN, actuator_delay=(0.0, 0.0)), physics="rk4", seed=1)
+    guessed = np.zeros_like(prompt.readings.commands)
+    guessed[[250, 600, 900], [0, 1, 0]] = 10.0
+    problem = Problem(ROBOT, prompt.readings.names, KNOWN)
+    found = problem.most_likely([replace(prompt.readings, guessed=guessed)])
+    value = {each.parameter.name: each for each in found.estimates}["delay"]
+    assert value.determined
+    assert abs(value.value) < 0.002
 
 
 def test_glitches_in_commands_do_not_move_the_delay(recorded: Recorded, tmp_path: Path) -> None:
@@ -406,6 +446,7 @@ def test_the_command_writes_a_robot_that_other_commands_take(readings: Readings,
         "robot.urdf",
     }
     record = json.loads((tmp_path / "mine" / "numbers.json").read_text())
+    assert record["predictions"]["no_change"][0][2] is None  # the last quarter of 8 s is too short for 1 s
     heights = {each["name"]: each["value"] for each in record["numbers"]}
     assert read_urdf(tmp_path / "mine" / "robot.urdf").com_height == heights["com_height"]
 

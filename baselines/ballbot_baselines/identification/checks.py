@@ -131,7 +131,7 @@ class Predictions(NamedTuple):
     horizons: tuple[float, ...]
     """s."""
     errors: np.ndarray
-    """(B, groups, horizons) of B robots, in the unit of the readings."""
+    """(B, groups, horizons) of B robots, in the unit of the readings; NaN where the log is too short."""
     constant: np.ndarray
     """(groups, horizons) of the prediction that nothing changes."""
 
@@ -147,20 +147,39 @@ class Predictions(NamedTuple):
         lanes, dt = problem.lanes(z), readings.dt
         found, forces = Innovations.of(problem.robot, readings, lanes), lanes.applied(readings)
         steps = [max(1, round(horizon / dt)) for horizon in HORIZONS]
-        starts = np.arange(round(_BEGIN / dt), len(readings.t) - max(steps), max(1, round(_STARTS / dt)))
-        restarts = np.array(readings.restarts, dtype=int)
-        starts = starts[[not ((restarts > i - _BEGIN / dt) & (restarts <= i + max(steps))).any() for i in starts]]
-        errors = np.empty((len(z), len(HORIZONS), len(readings.names)))
-        for lane in range(len(z)):
+        reached, starts = _starts(readings, steps)
+        errors = np.full((len(z), len(HORIZONS), len(readings.names)), np.nan)
+        for lane in range(len(z) if reached else 0):
             values = {name: float(value[0]) for name, value in problem.values(z[lane : lane + 1]).items()}
             robot = problem.robot_of(values)
-            later = readings.predicted(robot, found.states[starts, lane], forces[:, lane], starts, steps)
-            for i, step in enumerate(steps):
+            later = readings.predicted(robot, found.states[starts, lane], forces[:, lane], starts, reached)
+            for i, step in enumerate(reached):
                 wrong = later[i] + lanes.bias[lane] - readings.y[starts + step]
-                errors[lane, i] = np.nanmedian(np.abs(wrong), axis=0)
-        constant = [np.nanmedian(np.abs(readings.y[starts + j] - readings.y[starts]), axis=0) for j in steps]
+                errors[lane, i] = _medians(np.abs(wrong))
+        constant = np.full(errors.shape[1:], np.nan)
+        for i, step in enumerate(reached):
+            constant[i] = _medians(np.abs(readings.y[starts + step] - readings.y[starts]))
         groups = tuple(dict.fromkeys(map(Readings.group_of, readings.names)))
         members = [[i for i, name in enumerate(readings.names) if readings.group_of(name) == group] for group in groups]
         together = [np.sqrt(np.mean(np.stack([*errors, constant])[..., own] ** 2, axis=-1)) for own in members]
         *own, constant = np.stack(together, axis=1)
         return cls(groups, HORIZONS, np.array(own), constant)
+
+
+def _starts(readings: Readings, steps: list[int]) -> tuple[list[int], np.ndarray]:
+    """Those of the numbers of steps, growing, over which a log is long enough to predict, and the starts of predictions."""
+    dt, restarts = readings.dt, np.array(readings.restarts, dtype=int)
+    begin = _BEGIN / dt
+    for count in range(len(steps), 0, -1):
+        last = steps[count - 1]
+        starts = np.arange(round(begin), len(readings.t) - last, max(1, round(_STARTS / dt)))
+        starts = starts[[not ((restarts > i - begin) & (restarts <= i + last)).any() for i in starts]]
+        if len(starts):
+            return steps[:count], starts
+    return [], np.zeros(0, dtype=int)
+
+
+def _medians(sizes: np.ndarray) -> np.ndarray:
+    """(m,) medians of sizes (s, m), some of which are NaN; NaN where all are."""
+    known = ~np.isnan(sizes).all(axis=0)
+    return np.where(known, np.nanmedian(np.where(known, sizes, 0.0), axis=0), np.nan)

@@ -14,12 +14,13 @@ is installed.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
+import scipy.interpolate
 
 from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
 from ballbot_gym.robot import Ballbot, Kind
@@ -142,7 +143,7 @@ class Lanes(NamedTuple):
     delay: np.ndarray
     """(B,) s, by which the force follows the command later than the readings do, on average, the lag included."""
     lag: np.ndarray
-    """(B,) s, the part of it by which a first-order response follows; a little below 0 it is ahead."""
+    """(B,) s, the part of it by which a first-order response follows; below 0 it is ahead, by 0.3 of a step at most."""
     bias: np.ndarray
     """(B, m) of the readings."""
     noise: np.ndarray
@@ -163,13 +164,32 @@ class Lanes(NamedTuple):
         """
         t, commands = readings.t, readings.commands
         ends = np.append(t, t[-1] + readings.dt)
-        impulses = _impulses(ends, commands, ends[:, None] - (self.delay - self.lag))
+        most = _MOST_LEAD * readings.dt
+        lag = np.where(
+            self.lag < 0, most * np.tanh(self.lag / most), self.lag
+        )  # without a kink, where a search would stop
+        impulses = _impulses(ends, commands, ends[:, None] - (self.delay - lag))
         forces = np.diff(impulses, axis=0) / np.diff(ends)[:, None, None]
         dt = np.diff(ends)[:, None]
-        share = dt / (dt + np.maximum(self.lag, -_MOST_LEAD * dt))  # of a response that lags by this time on average
+        share = dt / (dt + np.maximum(lag, -_MOST_LEAD * dt))  # of a response that lags by this time on average
         for i in range(1, len(forces)):
             forces[i] = forces[i - 1] + share[i][:, None] * (forces[i] - forces[i - 1])
         return forces * self.strength[:, None]
+
+    def uncertain(self, readings: Readings) -> np.ndarray:
+        """(n, B, k) variance of these forces, N², where commands are `guessed`.
+
+        Each variance is shared among the steps about its delayed time by a cubic B-spline. So it is never negative, as it
+        would be after the spline of the commands, and it is as much for all delays: else a log would be likelier for the
+        delays that have less of it.
+        """
+        t, guessed = readings.t, readings.guessed
+        if guessed is None:
+            return np.zeros((len(t), len(self.delay), readings.commands.shape[1]))
+        n = len(t)
+        spline = scipy.interpolate.BSpline(np.arange(-2.0, n + 2), guessed**2, 3)
+        steps = np.interp(t[:, None] - self.delay, t, np.arange(n))
+        return spline(steps.clip(1, n - 2)) * self.strength[:, None] ** 2
 
 
 def _impulses(ends: np.ndarray, commands: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -226,10 +246,7 @@ class Innovations(NamedTuple):
         count = calls * LANES
         factors = np.ones((lane_count, m + readings.commands.shape[1])) if factors is None else factors
         forces, y = lanes.applied(readings) * factors[:, m:], readings.y[:, None, :] * factors[:, :m]
-        uncertain = np.zeros_like(forces)
-        if readings.guessed is not None:
-            # variances and not deviations, whose sum over steps would depend on the delay
-            uncertain = lanes.applied(replace(readings, commands=readings.guessed**2)) * lanes.strength[:, None]
+        uncertain = lanes.uncertain(readings)
         used = np.isfinite(readings.y)
         steps = np.zeros((n, count, 2 * m + 3 * forces.shape[2] + 1))
         steps[:, :lane_count] = np.concatenate(

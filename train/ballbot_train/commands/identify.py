@@ -185,7 +185,7 @@ def _show(result: Identified) -> None:
         [
             group,
             *(
-                f"{error:.3g}"
+                "–" if math.isnan(error) else f"{error:.3g}"
                 for j in range(len(shown.horizons))
                 for error in (*shown.errors[:, i, j], shown.constant[i, j])
             ),
@@ -254,8 +254,8 @@ def _write(result: Identified, logs: list[Log], robot: str, scores: list[dict[st
         "predictions": {
             "groups": shown.groups,
             "horizons": shown.horizons,
-            **dict(zip(("nominal", "identified"), shown.errors.tolist(), strict=True)),
-            "no_change": shown.constant.tolist(),
+            **dict(zip(("nominal", "identified"), map(_without_nan, shown.errors), strict=True)),
+            "no_change": _without_nan(shown.constant),
         },
         "controller": scores,
     }
@@ -264,6 +264,11 @@ def _write(result: Identified, logs: list[Log], robot: str, scores: list[dict[st
     figures.save(_residual_figure(result, logs[0].readings), out / "residuals.png")
     path = files.write(out / "robot.urdf", urdf_text(found.robot))
     console.print(f"numbers: {out / 'numbers.csv'}\nresiduals: {out / 'residuals.png'}\nrobot: {path}")
+
+
+def _without_nan(values: np.ndarray) -> list[Any]:
+    """What JSON can hold: None instead of NaN."""
+    return np.where(np.isnan(values), None, values).tolist()  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 def _residual_figure(result: Identified, readings: Readings) -> Figure:
