@@ -152,6 +152,20 @@ def test_identification_estimates_what_the_usual_robot_does_not_have():
     assert (found.com_x, found.axle_friction) == (pytest.approx(0.02), pytest.approx(0.3))
 
 
+def test_the_first_reading_of_a_filter_does_not_take_unknown_friction_for_a_lean():
+    task, robot, known = (
+        make_task("stabilize", "omni"),
+        replace(SAME, axle_friction=0.6),
+        replace(SAME, axle_friction=0.1),
+    )
+    env = BallbotEnv(task, "rk4", robot=robot, observation="sensors")
+    seen, _ = env.reset(seed=1, options={"state": np.array([0.0, 0.0, 0.0, 0.0, 0.5, -0.4, *[0.0] * 5])})
+    controller = FilteredController(task, known, "-ekf", LqrController(task, known))
+    controller.reset(0.0, seen, np.zeros(0))
+    assert np.abs(controller.filter.x[2:4]).max() < 0.1
+    np.testing.assert_allclose(controller.filter.x[4:6], [0.5, -0.4], atol=0.05)
+
+
 @pytest.mark.slow
 def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_of_mass_it_does_not_know():
     task = make_task("stabilize", "omni")

@@ -14,6 +14,7 @@ and the model then predicts the state at its end. Before the first reading the f
 the task's initial states, at the start position of the episode.
 """
 
+import math
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
@@ -183,8 +184,11 @@ def _corrected(
 
 
 _SHARE = 0.1  # of the force limit: what the force of a wheel may differ by
-_CHANGES = 0.1  # s in which it changes by that
-_ACCELEROMETER_BIAS = 0.2  # m/s², standard deviation
+_LASTS = 0.5  # s after which little of this difference is left
+_ACCELEROMETER_BIAS, _LEFT = (
+    0.2,
+    0.03,
+)  # m/s², standard deviations: of its bias, and of what is left of one that was identified
 _OF_GYROSCOPE, _OF_BOTH = np.eye(9, 3), np.eye(9, 5)
 """Which of the sensors feel each bias: the gyroscope's three, and two of the accelerometer."""
 _DRAWN = 256  # starts that tell what to expect of one
@@ -293,33 +297,35 @@ class _DisturbanceFilter(SensorFilter):
     """A `SensorFilter` that also estimates what a model with dry friction has wrong: two biases, and the wheels' forces.
 
     No model has dry friction exactly near rest. So the filter estimates by how much the force of each wheel differs from
-    that of the model. Controllers subtract this `disturbance` (3,), N, from their forces. The biases are those of the
-    accelerometer across the body's axis. They include errors of where the centre of mass is, because the motion alone shows
-    how far a centre of mass leans.
+    that of the model. Controllers subtract this `disturbance` (3,), N, from their forces. It fades: a difference that lasted
+    would explain every lean, and so hide a bias. The biases are those of the accelerometer across the body's axis. They
+    include errors of where the centre of mass is, because the motion alone shows how far a centre of mass leans.
     """
 
     def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
         super().__init__(task, params, errors)
         self._force = (_SHARE * params.force_limit) ** 2
+        identified = {"accel_x bias", "accel_y bias"} <= set(errors or {})
+        self._of_bias = (_LEFT if identified else _ACCELEROMETER_BIAS) ** 2
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
-        self.disturbance = np.zeros(3)
-        super().reset(seen, c)
-        self._z = np.concatenate([self._z, np.zeros(5)])
-        covariance = np.diag([0.0] * 14 + [_ACCELEROMETER_BIAS**2] * 2 + [self._force] * 3)
-        covariance[:14, :14] = self._p
-        self._p = covariance
+        mean, deviations = self.expected_start(c)
+        self._z = np.concatenate([seen[9:11], mean[2:], np.zeros(5)])
+        self._p = np.diag([*deviations**2, *[self._of_bias] * 2, *[self._force] * 3])
+        found, slopes = self._with_slopes(self.model, np.zeros(3))
+        self._correct(seen, found[11:], slopes[11:], _OF_BOTH)
+        self.disturbance = self._z[16:].copy()
 
     def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:
-        limit = self._params.force_limit
+        limit, lasts = self._params.force_limit, math.exp(-self._dt / _LASTS)
         u = np.clip(u, -limit, limit)
         self._correct(seen, *self._with_slopes(self._over_step, u), _OF_BOTH)
         after, slopes = self._with_slopes(self._after, u)
-        moves = np.eye(19)
+        moves = np.diag([*[1.0] * 16, *[lasts] * 3])
         moves[:11, :11], moves[:11, 16:] = slopes[:, :11], slopes[:, 11:]
-        self._z[:11] = after[:, 0]
+        self._z[:11], self._z[16:] = after[:, 0], lasts * self._z[16:]
         self._p = moves @ self._p @ moves.T
-        self._p += np.diag([*self.model_variance, 0.0, 0.0, *[self._dt / _CHANGES * self._force] * 3])
+        self._p += np.diag([*self.model_variance, 0.0, 0.0, *[(1 - lasts**2) * self._force] * 3])
         self.disturbance = self._z[16:].copy()
 
     def _with_slopes(self, function: casadi.Function, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
