@@ -123,14 +123,14 @@ class MujocoModel:
             data.qpos[own : own + 4] = self._pose[own : own + 4]
             mujoco.mj_kinematics(self.model, data)
             data.qvel[dof : dof + 3] = data.xmat[self._ball].reshape(3, 3).T @ (spin - turning)
-        speeds = self.robot.readings(x, np.zeros(3))[6:]
+        speeds = np.array(self.robot.readings(x, np.zeros(3))[6:])
         for wheel, speed in zip(self._wheels, speeds, strict=True):
             data.qvel[wheel.dof] = wheel.sign * speed
         data.ctrl[:] = self._held
         mujoco.mj_forward(self.model, data)
         self._start = x[:2].copy()
-        self.readings = np.array(self.robot.readings(x, np.zeros(3)), np.float64)  # as if the state lasted
-        self.readings[6:] *= self.control_dt
+        angles = self.control_dt * speeds  # as if the state lasted for a control step
+        self.readings = np.concatenate([self._felt(), angles])
         return self.state
 
     def step(self, u: np.ndarray) -> np.ndarray:
