@@ -1,0 +1,304 @@
+"""A proven lower bound of the cost of Stabilize in a vertical plane: `ballbot prove --planar`. The check is `planar_bound.c`.
+
+The bound is a polynomial V of four variables, stored in `planar_bound.json` with all other numbers of the theorem. Nothing
+of it is trusted: this module computes in exact fractions what the theorem in `planar_bound.c` asks of the goal, of the
+schedule a_k and of the range of states. Then it checks the inequality of the step in boxes that cover this range.
+"""
+
+import ctypes
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import machine_code
+from ballbot_gym.env import make_task
+from ballbot_gym.robot import PAPER, named_robot
+
+_PAIRS = list(itertools.combinations_with_replacement(range(4), 2))
+_PLANE = [0, 2, 4, 6]  # position, lean, speed and lean rate of a state
+_KNOTS, _SIZES = 16, (10, 100, 1000)
+_WIDEST = 1024.0
+_FLAGS = ("-O3", "-march=native")
+
+
+class _Problem(ctypes.Structure):
+    """`problem` of planar_bound.c."""
+
+    _fields_ = (
+        *((name, ctypes.c_double) for name in ("mass", "moment", "inertia", "gravity", "dt", "limit")),
+        *((name, ctypes.c_double * 4) for name in ("reach", "state_cost")),
+        ("force_cost", ctypes.c_double),
+        ("t", ctypes.c_double * 16),
+        ("gain", ctypes.c_double * 4),
+        *((name, ctypes.c_double) for name in ("widest", "rho", "outer", "share")),
+        *((name, ctypes.c_double * _KNOTS) for name in ("a", "r", "until")),
+        *((f"c{2 * n + 2}", ctypes.c_double * size) for n, size in enumerate(_SIZES)),
+        ("knots", ctypes.c_int64),
+    )
+
+
+class _Box(ctypes.Structure):
+    """`box` of planar_bound.c."""
+
+    _fields_ = (
+        ("mid", ctypes.c_double * 5),
+        ("half", ctypes.c_double * 5),
+        ("face", ctypes.c_int64),
+        ("depth", ctypes.c_int64),
+    )
+
+
+@dataclass(frozen=True)
+class _Certificate:
+    """The numbers of the theorem in planar_bound.c."""
+
+    t: list[list[float]]
+    """(4, 4) upper triangular: states (position, lean, speed, lean rate) are T z."""
+    gain: list[float]
+    """(4,) forces are near gain · z. Any numbers are right; good ones save boxes."""
+    exponents: list[list[int]]
+    """(m, 4) of the monomials of V, of degree 2, 4 or 6."""
+    coefficients: list[float]
+    """(m,) of these monomials."""
+    rho: float
+    """The bound holds where V < rho."""
+    outer: float
+    """V is only used where its quadratic part is at most this."""
+    share: float
+    """V is at least this share of its quadratic part."""
+    delta: float
+    """V is at most this in the goal."""
+    knots: list[tuple[float, float]]
+    """(a, r): the schedule a_k, by its slopes at some a. The last a is 1."""
+
+    @classmethod
+    def stored(cls) -> "_Certificate":
+        """The one of the package."""
+        return cls(**json.loads(Path(__file__).with_name("planar_bound.json").read_text(encoding="utf-8")))
+
+    def value(self, x: np.ndarray, degree: int = 6) -> np.ndarray:
+        """(n,) V of states (n, 4), rounded, or its part up to a degree."""
+        z = np.linalg.solve(np.array(self.t), x.T)[:, :, None]
+        exponents = np.array(self.exponents).T
+        kept = exponents.sum(0) <= degree
+        return np.prod(z ** exponents[:, None, kept], 0) @ np.array(self.coefficients)[kept]
+
+    def bound(self, x: np.ndarray, steps: int) -> np.ndarray:
+        """(n,) lower bounds of the cost of successful episodes of some steps from states (n, 4); NaN where none is proven."""
+        v, a = self.value(x), self.schedule(steps)
+        bound = np.maximum(a * v, v - self.delta)
+        inside = (self.value(x, 2) < self.outer) & (v < self.rho) & (bound <= self.rho - self.delta)
+        return np.where(inside, bound, np.nan)
+
+    def until(self) -> list[float]:
+        """For each knot, below which V the inequality is needed with it: δ/(1 − a) for the largest a that can follow it."""
+        ahead = [a for a, _ in self.knots[1:]] + [1.0]
+        following = [a + self._dt() * max(r for _, r in self.knots) + 1e-9 for a in ahead]
+        return [self.delta / (1 - a) * (1 + 1e-9) if a < 1 else float("inf") for a in following]
+
+    def schedule(self, steps: int) -> float:
+        """a_n for n steps, rounded down."""
+        slopes, a = np.array(self.knots), 0.0
+        for _ in range(steps):
+            a = min(1.0, a + self._dt() * float(np.interp(a, slopes[:, 0], slopes[:, 1])) * (1 - 1e-12))
+        return a - 1e-9 * (a < 1)
+
+    def _dt(self) -> float:
+        return make_task("stabilize").control_dt
+
+
+def _problem(certificate: _Certificate) -> _Problem:
+    """What planar_bound.c checks."""
+    task, robot = make_task("stabilize"), named_robot(PAPER)
+    out = _Problem(robot.moving_mass, robot.first_moment, robot.pivot_inertia, robot.gravity, task.control_dt)
+    out.limit, out.force_cost, out.knots, out.widest = (
+        robot.force_limit,
+        task.effort_weight,
+        len(certificate.knots),
+        _WIDEST,
+    )
+    out.reach[0], out.reach[1] = task.arena_radius, task.max_tilt
+    out.state_cost[:] = [task.position_weight, *[task.rest_weight] * 3]
+    out.t[:], out.gain[:] = np.ravel(certificate.t).tolist(), certificate.gain
+    out.rho, out.outer, out.share = certificate.rho, certificate.outer, certificate.share
+    for i, ((a, r), until) in enumerate(zip(certificate.knots, certificate.until(), strict=True)):
+        out.a[i], out.r[i], out.until[i] = a, r, until
+    for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
+        factors = [i for i in range(4) for _ in range(e[i])]
+        pairs = [_PAIRS.index((i, j)) for i, j in zip(factors[::2], factors[1::2], strict=True)]
+        getattr(out, f"c{len(factors)}")[sum(p * 10 ** (len(pairs) - 1 - n) for n, p in enumerate(pairs))] = c
+    return out
+
+
+def _check_numbers(certificate: _Certificate) -> int:
+    """Checks in exact fractions what the theorem asks of its numbers.
+
+    Returns:
+        n: the theorem's range of states lies in σ ≤ 2ⁿ.
+
+    Raises:
+        ArithmeticError: something does not hold.
+    """
+    problem, (a, r) = _problem(certificate), zip(*certificate.knots, strict=True)
+    t = [[Fraction(each) for each in row] for row in certificate.t]
+    inverse, quadratic = _inverse(t), _quadratic(certificate)
+    most, higher = _in_goal(certificate)
+    rho, dt = Fraction(certificate.rho), Fraction(problem.dt)
+    reach = [_root(rho / (dt * Fraction(cost))) for cost in problem.state_cost]
+    reach = [min(each, Fraction(limit)) if limit else each for each, limit in zip(reach, problem.reach, strict=True)]
+    farthest = max(sum(abs(row[j]) * reach[j] for j in range(4)) for row in inverse) ** 2
+    used = max(_inverse_diagonal(quadratic)) * Fraction(certificate.outer)
+    holds = {
+        "T is upper triangular": all(t[i][j] == 0 for i in range(4) for j in range(i)),
+        "the quadratic part of V is positive definite": _is_positive(quadratic),
+        "V is at most delta in the goal": most + higher <= Fraction(certificate.delta),
+        "the goal lies where V is used": most <= Fraction(certificate.outer),
+        "delta is less than rho": certificate.delta < certificate.rho,
+        "the knots rise from 0 to 1, with slopes >= 0": a[0] == 0
+        and a[-1] == 1
+        and sorted(a) == list(a)
+        and min(r) >= 0,
+    }
+    if wrong := [name for name, right in holds.items() if not right]:
+        raise ArithmeticError(f"it is not true that {' and that '.join(wrong)}")
+    return int(np.ceil(np.log2(float(max(farthest, used)) * 1.001)))
+
+
+def _quadratic(certificate: _Certificate) -> list[list[Fraction]]:
+    """The matrix of the quadratic part of V."""
+    out = [[Fraction(0)] * 4 for _ in range(4)]
+    for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
+        if sum(e) == 2:
+            i, j = (i for i in range(4) for _ in range(e[i]))
+            out[i][j] += Fraction(c) / 2
+            out[j][i] += Fraction(c) / 2
+    return out
+
+
+def _in_goal(certificate: _Certificate) -> tuple[Fraction, Fraction]:
+    """Upper bounds of the quadratic part of V in the goal, if it is convex, and of the rest of V there."""
+    inverse, quadratic = _inverse([[Fraction(each) for each in row] for row in certificate.t]), _quadratic(certificate)
+    goal = [Fraction(each) * Fraction(1 + 1e-9) for each in (0.1, float(np.deg2rad(2)), 0.1, 0.1)]
+    signs = itertools.product((1, -1), repeat=4)
+    corners = [[sum(row[j] * s[j] * goal[j] for j in range(4)) for row in inverse] for s in signs]
+    # a convex function is largest in a corner
+    most = max(sum(z[i] * quadratic[i][j] * z[j] for i in range(4) for j in range(4)) for z in corners)
+    largest, rest = [max(corner[i] for corner in corners) for i in range(4)], Fraction(0)
+    for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
+        if sum(e) > 2:
+            rest += abs(Fraction(c)) * _product(largest[i] ** e[i] for i in range(4))
+    return Fraction(most), rest
+
+
+def _inverse(t: list[list[Fraction]]) -> list[list[Fraction]]:
+    """Of an upper triangular matrix."""
+    out = [[Fraction(0)] * 4 for _ in range(4)]
+    for j in range(4):
+        for i in reversed(range(4)):
+            out[i][j] = (Fraction(i == j) - sum(t[i][k] * out[k][j] for k in range(i + 1, 4))) / t[i][i]
+    return out
+
+
+def _inverse_diagonal(matrix: list[list[Fraction]]) -> list[Fraction]:
+    """Of the inverse of a matrix with pivots that are not 0; zᵀMz ≤ 1 means z_i² ≤ (M⁻¹)_ii. Zeros if a pivot is 0."""
+    m = [[*row, *(Fraction(i == j) for j in range(4))] for i, row in enumerate(matrix)]
+    for p in range(4):
+        if m[p][p] == 0:
+            return [Fraction(0)] * 4
+        m[p] = [x / m[p][p] for x in m[p]]
+        for i in range(4):
+            if i != p:
+                m[i] = [x - m[i][p] * y for x, y in zip(m[i], m[p], strict=True)]
+    return [m[i][4 + i] for i in range(4)]
+
+
+def _is_positive(matrix: list[list[Fraction]]) -> bool:
+    """Whether a symmetric matrix is positive definite: all of its pivots are positive."""
+    m = [list(row) for row in matrix]
+    for p in range(4):
+        if m[p][p] <= 0:
+            return False
+        for i in range(p + 1, 4):
+            m[i] = [x - m[i][p] / m[p][p] * y for x, y in zip(m[i], m[p], strict=True)]
+    return True
+
+
+def _product(numbers: Any) -> Fraction:
+    out = Fraction(1)
+    for number in numbers:
+        out *= number
+    return out
+
+
+def _root(a: Fraction) -> Fraction:
+    """An upper bound of a square root."""
+    return Fraction(float(a) ** 0.5 * (1 + 1e-9))
+
+
+@cache
+def _code() -> ctypes.CDLL:
+    """planar_bound.c."""
+    source = Path(__file__).with_name("planar_bound.c").read_text(encoding="utf-8")
+    code = ctypes.CDLL(str(machine_code.library("planar-bound", source, _FLAGS)))
+    code.check.restype = ctypes.c_int64
+    code.check.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p]
+    code.look.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+    code.prepare.argtypes = [ctypes.c_void_p]
+    return code
+
+
+def _roots(most: int, moves: bool) -> list[_Box]:
+    """Boxes that cover σ ≤ 2ᵐᵒˢᵗ: σ by octaves, each component of y in halves."""
+    out = []
+    for octave in range(most, -6, -1):
+        low = 0.0 if octave == -5 else 2.0 ** (octave - 1)
+        high = 2.0**octave
+        for face, corner in itertools.product(range(4), itertools.product((-0.5, 0.5), repeat=3)):
+            mid, half = ((low + high) / 2, *corner, 0.0), ((high - low) / 2, 0.5, 0.5, 0.5, _WIDEST * moves)
+            out.append(_Box((ctypes.c_double * 5)(*mid), (ctypes.c_double * 5)(*half), face, 0))
+    return out
+
+
+def _checked(
+    certificate: _Certificate, most_boxes: int = 10**8, roots: slice = slice(None), workers: int | None = None
+) -> Iterator[tuple[float, int, bool]]:
+    """Checks a certificate. Yields after each root box: the share that is done, its boxes, and whether it is proven.
+
+    Args:
+        certificate: the numbers of the theorem.
+        most_boxes: after which a root box is given up.
+        roots: some of the root boxes of (B), for a quick trial. The theorem needs all.
+        workers: threads; default, one for each processor.
+
+    Raises:
+        ArithmeticError: a number of the theorem is wrong.
+        machine_code.NoMachineCodeError: there is no C compiler.
+    """
+    most, code, problem = _check_numbers(certificate), _code(), _problem(certificate)
+    code.prepare(ctypes.addressof(problem))
+
+    def check(job: tuple[_Box, bool]) -> tuple[int, bool]:
+        boxes = ctypes.c_int64()
+        left = code.check(ctypes.addressof(job[0]), int(job[1]), most_boxes, ctypes.addressof(boxes))
+        return boxes.value, left == 0
+
+    jobs = [(root, False) for root in _roots(most, moves=False)]
+    jobs += [(root, True) for root in _roots(most, moves=True)[roots]]
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        running = [pool.submit(check, job) for job in jobs]
+        for n, each in enumerate(as_completed(running)):
+            boxes, proven = each.result()
+            if not proven:
+                pool.shutdown(cancel_futures=True)
+            yield (n + 1) / len(jobs), boxes, proven
+            if not proven:
+                return

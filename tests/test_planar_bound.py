@@ -1,0 +1,115 @@
+"""The proven lower bound of planar Stabilize: its arithmetic is right, and bounds that claim too much are refused."""
+
+import ctypes
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballbot_gym.env import make_task
+from ballbot_gym.machine_code import NoMachineCodeError
+from ballbot_gym.robot import named_robot
+
+pytest.importorskip("casadi")
+
+from ballbot_baselines.proofs.planar_bound import _Box, _Certificate, _check_numbers, _checked, _code, _problem
+
+TERMS, VARIABLES, DIGITS = 126, 5, 50
+
+
+@pytest.fixture(scope="module")
+def certificate() -> _Certificate:
+    try:
+        _code()
+    except NoMachineCodeError:
+        pytest.skip("no C compiler")
+    return _Certificate.stored()
+
+
+@pytest.mark.parametrize("half", [0.2, 0.05, 0.01, 0.0])
+def test_models_of_a_box_hold_the_environments_step_in_50_digits(certificate: _Certificate, half: float) -> None:
+    """The equations are the robot's own, in mpmath, so nothing is shared with the C code but V's coefficients."""
+    mpmath, rng = pytest.importorskip("mpmath"), np.random.default_rng(1)
+    code, task, robot = _code(), make_task("stabilize"), named_robot("paper")
+    code.prepare(ctypes.addressof(problem := _problem(certificate)))
+    mid, face = np.append(0.5, rng.uniform(-0.7, 0.7, 4)) * (1, 1, 1, 1, 200), 2
+    halves = half * np.array([0.5, 1, 1, 1, 300])
+    out = np.zeros(3 * (TERMS + 1) + VARIABLES * TERMS)
+    box = _Box((ctypes.c_double * 5)(*mid), (ctypes.c_double * 5)(*halves), face, 0)
+    code.look(ctypes.addressof(box), out.ctypes.data)
+    models, powers = out[: 3 * (TERMS + 1)].reshape(3, -1), out[3 * (TERMS + 1) :].reshape(TERMS, VARIABLES).astype(int)
+    t = np.array(certificate.t)
+    with mpmath.workdps(DIGITS):
+
+        def v(x: list):
+            z = mpmath.lu_solve(mpmath.matrix(t.tolist()), mpmath.matrix(x))
+            pairs = zip(certificate.coefficients, certificate.exponents, strict=True)
+            return mpmath.fsum(mpmath.mpf(c) * mpmath.fprod(z[i] ** e[i] for i in range(4)) for c, e in pairs)
+
+        for _ in range(10):
+            xi = [mpmath.mpf(float(each)) for each in rng.uniform(-1, 1, 5)]
+            sigma, *y, w = (
+                mpmath.mpf(float(m)) + mpmath.mpf(float(h)) * each for m, h, each in zip(mid, halves, xi, strict=True)
+            )
+            y.insert(face, mpmath.mpf(1))
+            s = mpmath.sqrt(sigma)
+            x = [s * mpmath.fsum(mpmath.mpf(float(t[i, j])) * y[j] for j in range(4)) for i in range(4)]
+            u = s * (mpmath.fsum(mpmath.mpf(g) * each for g, each in zip(certificate.gain, y, strict=True)) + w)
+            zero = mpmath.mpf(0)
+            state = tuple(itertools.chain(*((each, zero) for each in x)))
+            after = robot.step(state, (u, zero), task.control_dt)
+            assert after[1::2] == (0, 0, 0, 0)  # the motion stays in its plane
+            cost = task.cost(state, (u, zero), ())
+            exact = ((v(list(after[::2])) - v(x)) / task.control_dt / sigma, cost / sigma, v(x) / sigma)
+            for number, model in zip(exact, models, strict=True):
+                terms = (
+                    mpmath.mpf(float(c)) * mpmath.fprod(a ** int(p) for a, p in zip(xi, row, strict=True))
+                    for c, row in zip(model, powers, strict=False)
+                )
+                assert abs(number - mpmath.fsum(terms)) <= model[-1]
+    assert problem.rho == certificate.rho
+    assert models[0, -1] < 1e4 * half**5 + 1e-8  # what is dropped is of the fifth order
+
+
+def test_some_boxes_of_the_stored_bound_are_proven(certificate: _Certificate) -> None:
+    steps = list(_checked(certificate, roots=slice(-32, None), workers=1))
+    assert all(proven for _, _, proven in steps)
+    assert steps[-1][0] == 1
+
+
+@pytest.mark.slow
+def test_the_stored_bound_is_proven(certificate: _Certificate) -> None:
+    assert all(proven for _, _, proven in _checked(certificate))
+
+
+@pytest.mark.parametrize("factor", [1.04, 1.2])
+def test_a_bound_that_claims_too_much_is_refused(certificate: _Certificate, factor: float) -> None:
+    wrong = replace(
+        certificate, coefficients=[factor * c for c in certificate.coefficients], delta=factor * certificate.delta
+    )
+    assert not all(proven for _, _, proven in _checked(wrong, roots=slice(-32, None), workers=1))
+
+
+def test_numbers_that_the_theorem_does_not_allow_are_refused(certificate: _Certificate) -> None:
+    _check_numbers(certificate)
+    lower = replace(certificate, delta=certificate.delta * (1 - 1e-3))
+    with pytest.raises(ArithmeticError, match="at most delta in the goal"):
+        _check_numbers(lower)
+    with pytest.raises(ArithmeticError, match="positive definite"):
+        _check_numbers(replace(certificate, coefficients=[-c for c in certificate.coefficients]))
+    with pytest.raises(ArithmeticError, match="knots"):
+        _check_numbers(replace(certificate, knots=certificate.knots[:-1]))
+
+
+def test_no_optimum_costs_less_than_the_bound(certificate: _Certificate) -> None:
+    from ballbot_baselines import find_optima
+
+    task, robot, x0 = make_task("stabilize"), named_robot("paper"), np.zeros((12, 8))
+    x0[:, ::2] = np.random.default_rng(2).uniform(-1, 1, (12, 4)) * (0.15, 0.05, 0.2, 0.3)
+    bound = certificate.bound(x0[:, ::2], task.steps)
+    x0, bound = x0[np.isfinite(bound)], bound[np.isfinite(bound)]
+    assert len(bound) >= 6
+    for optimum, least in zip(find_optima(task, robot, x0, np.zeros((len(x0), 0))), bound, strict=True):
+        assert optimum is not None
+        assert 0.9 * optimum.cost < least <= optimum.cost
