@@ -276,7 +276,7 @@ def _checked(
     Args:
         certificate: the numbers of the theorem.
         most_boxes: after which a root box is given up.
-        roots: some of the root boxes of (B), for a quick trial. The theorem needs all.
+        roots: some of the root boxes of (A) and of (B), for a quick trial. The theorem needs all.
         workers: threads; default, one for each processor.
 
     Raises:
@@ -291,8 +291,7 @@ def _checked(
         left = code.check(ctypes.addressof(job[0]), int(job[1]), most_boxes, ctypes.addressof(boxes))
         return boxes.value, left == 0
 
-    jobs = [(root, False) for root in _roots(most, moves=False)]
-    jobs += [(root, True) for root in _roots(most, moves=True)[roots]]
+    jobs = [(root, moves) for moves in (False, True) for root in _roots(most, moves)[roots]]
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         running = [pool.submit(check, job) for job in jobs]
         for n, each in enumerate(as_completed(running)):

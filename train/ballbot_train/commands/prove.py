@@ -63,10 +63,10 @@ def _prove_bound() -> None:
     task = make_task("stabilize")
     try:
         with progress_bar() as progress:
-            bar = progress.add_task("bound of planar costs", total=1.0)
+            bar = progress.add_task("bound of planar costs, %", total=100)
             for share, more, proven in _checked(certificate):
                 boxes += more
-                progress.update(bar, completed=share)
+                progress.update(bar, completed=100 * share)
                 if not proven:
                     raise ValueError(f"the bound is not proven: a box of {boxes} failed")
     except NoMachineCodeError as error:
