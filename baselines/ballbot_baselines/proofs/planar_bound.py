@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import machine_code
-from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, named_robot
+from ballbot_gym.robot import default_params
+from ballbot_gym.tasks.stabilize import Stabilize
 
 _PAIRS = list(itertools.combinations_with_replacement(range(4), 2))
 _PLANE = [0, 2, 4, 6]  # position, lean, speed and lean rate of a state
@@ -113,12 +113,12 @@ class _Certificate:
         return a - 1e-9 * (a < 1)
 
     def _dt(self) -> float:
-        return make_task("stabilize").control_dt
+        return Stabilize().control_dt
 
 
 def _problem(certificate: _Certificate) -> _Problem:
     """What planar_bound.c checks."""
-    task, robot = make_task("stabilize"), named_robot(PAPER)
+    task, robot = Stabilize(), default_params()
     out = _Problem(robot.moving_mass, robot.first_moment, robot.pivot_inertia, robot.gravity, task.control_dt)
     out.limit, out.force_cost, out.knots, out.widest = (
         robot.force_limit,
