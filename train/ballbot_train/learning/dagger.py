@@ -10,8 +10,8 @@ episode reaches near its optimum, and the states around it too: every batch draw
 fits the slope of the policy together with its value, as in Czarnecki et al., "Sobolev training for neural networks" (2017).
 There are three exceptions, whose states label themselves alone, with errors divided by the cost of the episode's optimum, as
 in the regret. If a goal ends the episode, the derivative is steep before the goal, and policies that were fitted to it missed
-the goal more often. Next to an obstacle it is steep too, and no policy was measured there yet. If observations depend on the
-past, on noise or on delayed forces, they are not known for other states.
+the goal more often. Next to an obstacle it is steep too, and policies that were fitted to it touched more obstacles. If
+observations depend on the past, on noise or on delayed forces, they are not known for other states.
 
 A share of the episodes begins where the learner fails or pays most, because failures are at the edge of what can be recovered
 from. On a track the expert has access to each episode's robot. The learner gets observations alone.
