@@ -18,7 +18,7 @@ import tyro
 from scipy.linalg import eigh
 
 from ballbot_baselines import find_optima
-from ballbot_baselines.proofs.planar_bound import _PLANE, _Certificate, _in_goal
+from ballbot_baselines.proofs.planar_bound import _PLANE, PlanarBound, _in_goal
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import files
 from ballbot_gym.env import make_task
@@ -114,7 +114,7 @@ class Fit:
         return out
 
 
-def measure(certificate: _Certificate, count: int) -> None:
+def measure(certificate: PlanarBound, count: int) -> None:
     """Prints which share of the optimal cost the bound is, in random states, and how many planar starts it covers."""
     rng, a = np.random.default_rng(5), certificate.schedule(TASK.steps)
     most = (certificate.rho - certificate.delta) / a
@@ -162,7 +162,7 @@ def main(
     """
     fit = Fit(6, margin)
     fit.improve(rho, samples, rounds)
-    certificate = _Certificate(
+    certificate = PlanarBound(
         t=fit.t.tolist(),
         gain=np.round(-fit.gain @ fit.t, 3).tolist(),
         exponents=fit.exponents.tolist(),

@@ -13,22 +13,22 @@ from ballbot_gym.robot import named_robot
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines.proofs.planar_bound import _Box, _Certificate, _check_numbers, _checked, _code, _problem
+from ballbot_baselines.proofs.planar_bound import PlanarBound, _Box, _check_numbers, _code, _problem, check_parts
 
 TERMS, VARIABLES, DIGITS = 126, 5, 50
 
 
 @pytest.fixture(scope="module")
-def certificate() -> _Certificate:
+def certificate() -> PlanarBound:
     try:
         _code()
     except NoMachineCodeError:
         pytest.skip("no C compiler")
-    return _Certificate.stored()
+    return PlanarBound.stored()
 
 
 @pytest.mark.parametrize("half", [0.2, 0.05, 0.01, 0.0])
-def test_models_of_a_box_hold_the_environments_step_in_50_digits(certificate: _Certificate, half: float) -> None:
+def test_models_of_a_box_hold_the_environments_step_in_50_digits(certificate: PlanarBound, half: float) -> None:
     """The equations are the robot's own, in mpmath, so nothing is shared with the C code but V's coefficients."""
     mpmath, rng = pytest.importorskip("mpmath"), np.random.default_rng(1)
     code, task, robot = _code(), make_task("stabilize"), named_robot("paper")
@@ -72,26 +72,26 @@ def test_models_of_a_box_hold_the_environments_step_in_50_digits(certificate: _C
     assert models[0, -1] < 1e4 * half**5 + 1e-8  # what is dropped is of the fifth order
 
 
-def test_some_boxes_of_the_stored_bound_are_proven(certificate: _Certificate) -> None:
-    steps = list(_checked(certificate, roots=slice(-32, None), workers=1))
+def test_some_boxes_of_the_stored_bound_are_proven(certificate: PlanarBound) -> None:
+    steps = list(check_parts(certificate, roots=slice(-32, None), workers=1))
     assert all(proven for _, _, proven in steps)
     assert steps[-1][0] == 1
 
 
 @pytest.mark.slow
-def test_the_stored_bound_is_proven(certificate: _Certificate) -> None:
-    assert all(proven for _, _, proven in _checked(certificate))
+def test_the_stored_bound_is_proven(certificate: PlanarBound) -> None:
+    assert all(proven for _, _, proven in check_parts(certificate))
 
 
 @pytest.mark.parametrize("factor", [1.04, 1.2])
-def test_a_bound_that_claims_too_much_is_refused(certificate: _Certificate, factor: float) -> None:
+def test_a_bound_that_claims_too_much_is_refused(certificate: PlanarBound, factor: float) -> None:
     wrong = replace(
         certificate, coefficients=[factor * c for c in certificate.coefficients], delta=factor * certificate.delta
     )
-    assert not all(proven for _, _, proven in _checked(wrong, roots=slice(-32, None), workers=1))
+    assert not all(proven for _, _, proven in check_parts(wrong, roots=slice(-32, None), workers=1))
 
 
-def test_numbers_that_the_theorem_does_not_allow_are_refused(certificate: _Certificate) -> None:
+def test_numbers_that_the_theorem_does_not_allow_are_refused(certificate: PlanarBound) -> None:
     _check_numbers(certificate)
     lower = replace(certificate, delta=certificate.delta * (1 - 1e-3))
     with pytest.raises(ArithmeticError, match="at most delta in the goal"):
@@ -102,7 +102,7 @@ def test_numbers_that_the_theorem_does_not_allow_are_refused(certificate: _Certi
         _check_numbers(replace(certificate, knots=certificate.knots[:-1]))
 
 
-def test_no_optimum_costs_less_than_the_bound(certificate: _Certificate) -> None:
+def test_no_optimum_costs_less_than_the_bound(certificate: PlanarBound) -> None:
     from ballbot_baselines import find_optima
 
     task, robot, x0 = make_task("stabilize"), named_robot("paper"), np.zeros((12, 8))

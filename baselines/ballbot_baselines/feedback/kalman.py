@@ -185,10 +185,8 @@ def _corrected(
 
 _SHARE = 0.1  # of the force limit: what the force of a wheel may differ by
 _LASTS = 0.5  # s after which little of this difference is left
-_ACCELEROMETER_BIAS, _LEFT = (
-    0.2,
-    0.03,
-)  # m/s², standard deviations: of its bias, and of what is left of one that was identified
+_ACCELEROMETER_BIAS = 0.2  # m/s², standard deviation of its bias
+_LEFT = 0.03  # m/s², the same of what is left of a bias that was identified
 _OF_GYROSCOPE, _OF_BOTH = np.eye(9, 3), np.eye(9, 5)
 """Which of the sensors feel each bias: the gyroscope's three, and two of the accelerometer."""
 _DRAWN = 256  # starts that tell what to expect of one

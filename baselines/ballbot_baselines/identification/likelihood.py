@@ -165,9 +165,8 @@ class Lanes(NamedTuple):
         t, commands = readings.t, readings.commands
         ends = np.append(t, t[-1] + readings.dt)
         most = _MOST_LEAD * readings.dt
-        lag = np.where(
-            self.lag < 0, most * np.tanh(self.lag / most), self.lag
-        )  # without a kink, where a search would stop
+        # below 0 without a kink, where a search would stop
+        lag = np.where(self.lag < 0, most * np.tanh(self.lag / most), self.lag)
         impulses = _impulses(ends, commands, ends[:, None] - (self.delay - lag))
         forces = np.diff(impulses, axis=0) / np.diff(ends)[:, None, None]
         dt = np.diff(ends)[:, None]

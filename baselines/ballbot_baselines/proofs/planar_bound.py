@@ -58,7 +58,7 @@ class _Box(ctypes.Structure):
 
 
 @dataclass(frozen=True)
-class _Certificate:
+class PlanarBound:
     """The numbers of the theorem in planar_bound.c."""
 
     t: list[list[float]]
@@ -81,7 +81,7 @@ class _Certificate:
     """(a, r): the schedule a_k, by its slopes at some a. The last a is 1."""
 
     @classmethod
-    def stored(cls) -> "_Certificate":
+    def stored(cls) -> "PlanarBound":
         """The one of the package."""
         return cls(**json.loads(Path(__file__).with_name("planar_bound.json").read_text(encoding="utf-8")))
 
@@ -116,7 +116,7 @@ class _Certificate:
         return Stabilize().control_dt
 
 
-def _problem(certificate: _Certificate) -> _Problem:
+def _problem(certificate: PlanarBound) -> _Problem:
     """What planar_bound.c checks."""
     task, robot = Stabilize(), default_params()
     out = _Problem(robot.moving_mass, robot.first_moment, robot.pivot_inertia, robot.gravity, task.control_dt)
@@ -139,7 +139,7 @@ def _problem(certificate: _Certificate) -> _Problem:
     return out
 
 
-def _check_numbers(certificate: _Certificate) -> int:
+def _check_numbers(certificate: PlanarBound) -> int:
     """Checks in exact fractions what the theorem asks of its numbers.
 
     Returns:
@@ -173,7 +173,7 @@ def _check_numbers(certificate: _Certificate) -> int:
     return int(np.ceil(np.log2(float(max(farthest, used)) * 1.001)))
 
 
-def _quadratic(certificate: _Certificate) -> list[list[Fraction]]:
+def _quadratic(certificate: PlanarBound) -> list[list[Fraction]]:
     """The matrix of the quadratic part of V."""
     out = [[Fraction(0)] * 4 for _ in range(4)]
     for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
@@ -184,7 +184,7 @@ def _quadratic(certificate: _Certificate) -> list[list[Fraction]]:
     return out
 
 
-def _in_goal(certificate: _Certificate) -> tuple[Fraction, Fraction]:
+def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
     """Upper bounds of the quadratic part of V in the goal, if it is convex, and of the rest of V there."""
     inverse, quadratic = _inverse([[Fraction(each) for each in row] for row in certificate.t]), _quadratic(certificate)
     goal = [Fraction(each) * Fraction(1 + 1e-9) for each in (0.1, float(np.deg2rad(2)), 0.1, 0.1)]
@@ -268,8 +268,8 @@ def _roots(most: int, moves: bool) -> list[_Box]:
     return out
 
 
-def _checked(
-    certificate: _Certificate, most_boxes: int = 10**8, roots: slice = slice(None), workers: int | None = None
+def check_parts(
+    certificate: PlanarBound, most_boxes: int = 10**8, roots: slice = slice(None), workers: int | None = None
 ) -> Iterator[tuple[float, int, bool]]:
     """Checks a certificate. Yields after each root box: the share that is done, its boxes, and whether it is proven.
 

@@ -282,7 +282,9 @@ def _residual_figure(result: Identified, readings: Readings) -> Figure:
     for axis, name, values in zip(figure.subplots(rows, 2, squeeze=False).flat, readings.names, scaled.T, strict=False):
         axis.plot(readings.t[::every], values[::every], ".", ms=2, alpha=0.5)
         read = values[np.isfinite(values)]
-        beyond = f"{np.mean(np.abs(read) > 1.96):.1%} beyond ±1.96, where 5 % are expected" if read.size else "no reading"
+        beyond = (
+            f"{np.mean(np.abs(read) > 1.96):.1%} beyond ±1.96, where 5 % are expected" if read.size else "no reading"
+        )
         axis.set_title(f"{name}: {beyond}", fontsize=9)
         axis.set_ylim(-5, 5)
         axis.grid(alpha=0.3)

@@ -3,7 +3,7 @@
 import time
 
 from ballbot_baselines.proofs.minima import _lines, _summary
-from ballbot_baselines.proofs.planar_bound import _Certificate, _checked
+from ballbot_baselines.proofs.planar_bound import PlanarBound, check_parts
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.machine_code import NoMachineCodeError
@@ -59,12 +59,12 @@ def prove(
 
 def _prove_bound() -> None:
     """Checks the stored lower bound of planar costs."""
-    began, certificate, boxes = time.perf_counter(), _Certificate.stored(), 0
+    began, certificate, boxes = time.perf_counter(), PlanarBound.stored(), 0
     task = make_task("stabilize")
     try:
         with progress_bar() as progress:
             bar = progress.add_task("bound of planar costs, %", total=100)
-            for share, more, proven in _checked(certificate):
+            for share, more, proven in check_parts(certificate):
                 boxes += more
                 progress.update(bar, completed=100 * share)
                 if not proven:
