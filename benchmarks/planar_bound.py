@@ -21,10 +21,10 @@ from ballbot_baselines import find_optima
 from ballbot_baselines.proofs.planar_bound import _PLANE, PlanarBound, _in_goal
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import files
-from ballbot_gym.env import make_task
 from ballbot_gym.robot import PAPER, named_robot
+from ballbot_gym.tasks import Stabilize
 
-TASK, ROBOT = make_task("stabilize"), named_robot(PAPER)
+TASK, ROBOT = Stabilize(), named_robot(PAPER)
 COST = np.array([TASK.position_weight, *[TASK.rest_weight] * 3])
 KNOTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 LARGEST_FORCE = 400.0  # N, of the worst ones that a fit tries
