@@ -75,7 +75,7 @@ def test_functions_are_compiled_once_and_then_read_from_the_cache(folder, monkey
     compiled.compiled("powers", powers())
     (library,) = folder.iterdir()  # nothing else is left there
     assert library.name.startswith("powers-")
-    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: pytest.fail("compiled again"))
+    monkeypatch.setattr(subprocess, "Popen", lambda *args, **kwargs: pytest.fail("compiled again"))
     assert values(compiled.compiled("powers", powers())) == [9.0, 27.0]
 
 
@@ -169,13 +169,15 @@ def test_compiler_that_is_none_leaves_functions_interpreted(fake_compiler, caplo
 
 @posix
 @pytest.mark.parametrize("hangs", ["at --version", "when it compiles"])
-def test_compiler_that_hangs_is_given_up_and_not_asked_again(fake_compiler, monkeypatch, caplog, hangs):
+def test_compiler_that_hangs_is_ended_with_its_passes_and_not_asked_again(fake_compiler, monkeypatch, caplog, hangs):
     monkeypatch.setattr(libraries, "_VERSION_SECONDS", 0.2 if hangs == "at --version" else 10.0)
     monkeypatch.setattr(libraries, "_COMPILE_SECONDS", 0.2)
     answer = b"" if hangs == "at --version" else b'[ "$1" = --version ] && exit 0\n'
-    program = fake_compiler(b"#!/bin/sh\n" + answer + b"exec sleep 30\n")
+    program = fake_compiler(b"#!/bin/sh\n" + answer + b"sleep 29.753\n")
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
+    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
+    assert "sleep 29.753" not in running.splitlines()
     assert f"{program} did not finish within 0.2 s" in caplog.text
     monkeypatch.setattr(libraries, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
     assert compiled.compiled("others", functions) is functions

@@ -11,6 +11,7 @@ import logging
 import os
 import platform
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -250,10 +251,20 @@ def _kept(built: Path, folder: Path, stem: str) -> Path:
 
 
 def _run(command: list[str], seconds: float | None, check: bool) -> str:
-    """Standard output of a program; bytes that are no UTF-8 are replaced."""
-    return subprocess.run(
-        command, capture_output=True, encoding="utf-8", errors="replace", check=check, timeout=seconds
-    ).stdout
+    """Standard output of a program; bytes that are no UTF-8 are replaced.
+
+    If it takes too long, it ends with all that it has started: a compiler that is killed alone leaves its passes running.
+    """
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "encoding": "utf-8", "errors": "replace"}
+    with subprocess.Popen(command, start_new_session=not _WINDOWS, **pipes) as process:
+        try:
+            output, errors = process.communicate(timeout=seconds)
+        except BaseException:
+            process.kill() if _WINDOWS else os.killpg(process.pid, signal.SIGKILL)
+            raise
+    if check and process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command, output, errors)
+    return output
 
 
 def _shipped(code: Code) -> Path | None:
