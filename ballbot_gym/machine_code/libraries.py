@@ -159,7 +159,7 @@ def printed(name: str, problem: tuple[Any, ...], kinds: tuple[type, ...], source
             check_private(path.parent, "BALLBOT_CACHE")
             check_private(path, "BALLBOT_CACHE")
             return path.read_text(encoding="utf-8")
-    except (OSError, RuntimeError, UnicodeDecodeError):  # `library` says what is wrong with the folder
+    except (OSError, RuntimeError, ValueError):  # `library` says what is wrong with the folder
         return source()
     code = source()
     with contextlib.suppress(OSError):
