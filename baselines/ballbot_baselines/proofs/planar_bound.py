@@ -156,7 +156,6 @@ def _check_numbers(certificate: PlanarBound) -> int:
     reach = [_root(rho / (dt * Fraction(cost))) for cost in problem.state_cost]
     reach = [min(each, Fraction(limit)) if limit else each for each, limit in zip(reach, problem.reach, strict=True)]
     farthest = max(sum(abs(row[j]) * reach[j] for j in range(4)) for row in inverse) ** 2
-    used = max(_inverse_diagonal(quadratic)) * Fraction(certificate.outer)
     holds = {
         "T is upper triangular": all(t[i][j] == 0 for i in range(4) for j in range(i)),
         "the quadratic part of V is positive definite": _is_positive(quadratic),
@@ -170,6 +169,8 @@ def _check_numbers(certificate: PlanarBound) -> int:
     }
     if wrong := [name for name, right in holds.items() if not right]:
         raise ArithmeticError(f"it is not true that {' and that '.join(wrong)}")
+    # zᵀMz ≤ outer means z_i² ≤ outer (M⁻¹)_ii
+    used = max(row[i] for i, row in enumerate(_inverse(quadratic))) * Fraction(certificate.outer)
     return int(np.ceil(np.log2(float(max(farthest, used)) * 1.001)))
 
 
@@ -199,26 +200,15 @@ def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
     return Fraction(most), rest
 
 
-def _inverse(t: list[list[Fraction]]) -> list[list[Fraction]]:
-    """Of an upper triangular matrix."""
-    out = [[Fraction(0)] * 4 for _ in range(4)]
-    for j in range(4):
-        for i in reversed(range(4)):
-            out[i][j] = (Fraction(i == j) - sum(t[i][k] * out[k][j] for k in range(i + 1, 4))) / t[i][i]
-    return out
-
-
-def _inverse_diagonal(matrix: list[list[Fraction]]) -> list[Fraction]:
-    """Of the inverse of a matrix with pivots that are not 0; zᵀMz ≤ 1 means z_i² ≤ (M⁻¹)_ii. Zeros if a pivot is 0."""
+def _inverse(matrix: list[list[Fraction]]) -> list[list[Fraction]]:
+    """Of a matrix whose pivots are not 0, as of an upper triangular one or a positive definite one."""
     m = [[*row, *(Fraction(i == j) for j in range(4))] for i, row in enumerate(matrix)]
     for p in range(4):
-        if m[p][p] == 0:
-            return [Fraction(0)] * 4
         m[p] = [x / m[p][p] for x in m[p]]
         for i in range(4):
             if i != p:
                 m[i] = [x - m[i][p] * y for x, y in zip(m[i], m[p], strict=True)]
-    return [m[i][4 + i] for i in range(4)]
+    return [row[4:] for row in m]
 
 
 def _is_positive(matrix: list[list[Fraction]]) -> bool:
