@@ -109,6 +109,19 @@ def test_processes_that_compile_at_once_all_get_a_whole_library(folder):
     assert len(list(folder.iterdir())) == 1
 
 
+@posix
+@needs_compiler
+def test_of_processes_that_need_a_library_at_once_one_compiles_it(folder, tmp_path, monkeypatch):
+    program, runs = tmp_path / "slow-compiler", tmp_path / "runs"
+    program.write_text(f'#!/bin/sh\n[ "$1" = --version ] || {{ echo run >> "{runs}"; sleep 1; }}\nexec cc "$@"\n')
+    program.chmod(0o700)
+    monkeypatch.setenv("CC", str(program))
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        assert pool.map(compile_and_evaluate, [str(folder)] * 2) == [([9.0, 27.0], False)] * 2
+    assert runs.read_text().split() == ["run"]
+    assert len(list(folder.iterdir())) == 1
+
+
 def compile_and_evaluate(folder):
     os.environ["BALLBOT_CACHE"] = folder
     functions = compiled.compiled("powers", powers())

@@ -16,7 +16,7 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -31,7 +31,7 @@ _FLAGS = ("-shared",) if _WINDOWS else ("-fPIC", "-shared")
 _NATIVE = "-march=native"  # some compilers do not support it for some processors, such as clang for ARM
 _LIBRARIES = () if _WINDOWS else ("-lm",)
 _DIGITS = 24  # of SHA-256, in the names of libraries
-_COMPILE_SECONDS = 120.0  # after which a compiler counts as hanging
+_COMPILE_SECONDS = 300.0  # after which a compiler counts as hanging; on a busy machine some codes need a hundred
 _VERSION_SECONDS = 10.0
 _WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
@@ -228,12 +228,40 @@ def check_private(path: Path, variable: str) -> None:
 
 
 def _compiled(code: Code, compiler: str, folder: Path, stem: str) -> Path:
-    """The library of that name, compiled for this very processor if the compiler can do that."""
-    _log.info("compiling %s, once on this machine", code.name)
+    """The library of that name, compiled for this very processor if the compiler can do that.
+
+    Of processes that need the same library at once, one compiles it, and the others wait for it.
+    """
+    with _alone(folder / f".{stem}.lock"):
+        if (path := _whole(folder, stem, own=True)) is not None:
+            return path
+        _log.info("compiling %s, once on this machine", code.name)
+        try:
+            return code.build(compiler, folder, stem, (_NATIVE,), _COMPILE_SECONDS)
+        except subprocess.CalledProcessError:
+            return code.build(compiler, folder, stem, (), _COMPILE_SECONDS)
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Holds a lock file, for as long as a compiler may take at most. Without the library of locks, it does not wait."""
     try:
-        return code.build(compiler, folder, stem, (_NATIVE,), _COMPILE_SECONDS)
-    except subprocess.CalledProcessError:
-        return code.build(compiler, folder, stem, (), _COMPILE_SECONDS)
+        import filelock
+    except ImportError:
+        yield
+        return
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(timeout=_COMPILE_SECONDS)
+    except (filelock.Timeout, NotImplementedError):  # some file systems have no locks
+        yield
+        return
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows removes no open file
+            path.unlink()
+        lock.release()
 
 
 def _kept(built: Path, folder: Path, stem: str) -> Path:
