@@ -89,7 +89,10 @@ def test_the_optimums_actions_earn_its_return_in_gymnasiums_own(name, seed):
     assert earned == pytest.approx(task.survival_pay - optimum.cost, abs=1e-5)
 
 
-@pytest.mark.parametrize(("name", "seed"), [("pendulum", 53), ("mountain_car", 139), ("mountain_car", 176)])
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("pendulum", 53), ("mountain_car", 139), pytest.param("mountain_car", 176, marks=pytest.mark.slow)],
+)
 def test_the_search_finds_the_certified_optimum(name, seed):
     """In these episodes the best motion is close to other local optima, or starts from none of the cheapest guesses."""
     task, robot = make_task(name), robot_of(name)

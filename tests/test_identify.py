@@ -126,6 +126,7 @@ def test_the_slope_of_the_likelihood_is_that_of_its_values(readings: Readings) -
         assert slope[i] == pytest.approx((up - down) / (2 * step), rel=0.02, abs=0.5)
 
 
+@pytest.mark.slow  # it compiles for half a minute
 def test_predictions_of_a_slow_log_are_of_the_next_reading_at_least(readings: Readings) -> None:
     t, y, commands = (each[::50] for each in (readings.t, readings.y, readings.commands))
     problem = Problem(ROBOT, readings.names)

@@ -42,7 +42,7 @@ def two_takes():
     return Replay("a title", takes, (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)),))
 
 
-def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects():
+def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects(interpreted):
     pytest.importorskip("pybullet")
     shown = certified_replay("stabilize", ["trajopt"], 1, physics="bullet", robot="rolling", frictions=[0.8, 0.6])
     expected, smoother = shown.takes

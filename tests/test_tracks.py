@@ -157,6 +157,7 @@ def test_adaptive_nmpc_learns_robot_and_delay_in_a_second():
     assert controller.filter.delay == 2
 
 
+@pytest.mark.slow
 def test_adaptive_nmpc_passes_the_gate_in_an_engine_of_first_order():
     """Its errors are the same in many steps on end, and no other robot explains them."""
     row = evaluate("nmpc-adaptive", "turn", 1, "bullet", randomization="unknown")

@@ -71,9 +71,9 @@ class Code:
 
     @property
     def portable_flags(self) -> tuple[str, ...]:
-        """The flags without GCC's `--param NAME=VALUE`, which other compilers refuse."""
+        """The flags without GCC's `--param NAME=VALUE` and `-fira-…`, which other compilers refuse."""
         pairs = zip(("", *self.flags), self.flags, strict=False)
-        return tuple(flag for before, flag in pairs if "--param" not in (before, flag))
+        return tuple(flag for before, flag in pairs if "--param" not in (before, flag) and "-fira-" not in flag)
 
     def build(
         self, compiler: str, folder: Path, stem: str, extra: tuple[str, ...] = (), seconds: float | None = None
