@@ -14,7 +14,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines.solvers import compiled
-from ballbot_gym.machine_code import libraries
+from ballbot_gym.machine_code import codegen, libraries
 
 needs_compiler = pytest.mark.skipif(libraries.compiler() is None, reason="no C compiler")
 posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
@@ -69,6 +69,23 @@ def test_lanes_give_the_values_of_every_stage(folder, caplog):
             # vector versions of sine and cosine are wrong by up to 4 units in the last place
             np.testing.assert_allclose(np.array(found)[:, k], np.array(expected).ravel(), rtol=1e-15, atol=2e-15)
         assert float(fast_product(x)[k]) == pytest.approx(float(product(x[:, k])), rel=1e-15)
+
+
+@needs_compiler
+@pytest.mark.parametrize("piece", [2, 7, 40])
+def test_a_long_function_is_computed_in_pieces(folder, monkeypatch, piece):
+    """Of which later ones read what earlier ones computed, constants among them."""
+    monkeypatch.setattr(codegen, "_LONGEST", 10)
+    monkeypatch.setattr(codegen, "_PIECE", piece)
+    x = casadi.SX.sym("x", 2)
+    a = b = x[0]
+    for i in range(30):
+        a, b = casadi.sin(a) + 0.3 * b, casadi.if_else(a > 0.3, b - i * x[1], 2 * b / (2 + x[0] ** 2))
+    plain = casadi.Function("mixed", [x], [casadi.vertcat(a, b), a * b, a + 0.3])
+    (fast,) = compiled.in_lanes("mixed", (plain,))
+    states = np.random.default_rng(0).normal(size=(2, compiled.LANES))
+    for got, expected in zip(fast(states), plain.map(compiled.LANES)(states), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
 
 
 @needs_compiler

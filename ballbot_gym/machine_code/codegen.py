@@ -9,7 +9,7 @@ it.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ballbot_gym import ops
 from ballbot_gym.lazy import imports_of
@@ -22,6 +22,8 @@ with imports_of("the machine code of batches", "baselines"):
 
 LANES = 16
 """Robots per block: as many float32 as an AVX-512 register holds."""
+
+_LONGEST, _PIECE = 40_000, 500  # lines of a C function, and of its pieces where it is longer
 
 Part = tuple[str, Sequence[Any]]
 """A pointer's name in C, and the symbols that are read from its rows, or the expressions that are written to them."""
@@ -224,6 +226,18 @@ def _symbols(name: str, count: int) -> tuple[Any, ...]:
     return tuple(casadi.SX.sym(f"{name}{i}") for i in range(count))
 
 
+class _Line(NamedTuple):
+    """A line of C that computes one operation."""
+
+    text: str
+    made: int | None
+    """The register that it writes; None where it writes a result."""
+    given: Sequence[int]
+    """The registers that it reads."""
+    constant: bool
+    """Whether it writes a constant."""
+
+
 def block(name: str, inputs: Sequence[Part], outputs: Sequence[Part]) -> str:
     """A C function that computes expressions for `LANES` robots.
 
@@ -232,18 +246,18 @@ def block(name: str, inputs: Sequence[Part], outputs: Sequence[Part]) -> str:
     read = [(f"{pointer}[{i} * s{pointer} + k]", symbol) for pointer, part in inputs for i, symbol in enumerate(part)]
     write = [(f"{pointer}[{i} * s{pointer} + k]", value) for pointer, part in outputs for i, value in enumerate(part)]
     function = casadi.Function(name, [symbol for _, symbol in read], [casadi.SX(v) for _, v in write], {"cse": True})
-    lines, registers = [], set()
+    lines: list[_Line] = []
     truths, infinite = set(), set()  # registers that hold a truth value, and infinity
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
         given, made = function.instruction_input(k), function.instruction_output(k)
         if operation == casadi.OP_OUTPUT:
-            lines.append(f"{write[made[0]][0]} = w{given[0]};")
+            lines.append(_Line(f"{write[made[0]][0]} = w{given[0]};", None, given, False))
             continue
         if operation == casadi.OP_INPUT:
-            value = read[given[0]][0]
+            value, given = read[given[0]][0], ()
         elif operation == casadi.OP_CONST:
-            value = _literal(function.instruction_constant(k))
+            value, given = _literal(function.instruction_constant(k)), ()
         elif operation in OPERATIONS:
             value = OPERATIONS[operation].format(*(f"w{i}" for i in given))
         elif operation in _LOGIC:
@@ -254,18 +268,59 @@ def block(name: str, inputs: Sequence[Part], outputs: Sequence[Part]) -> str:
             value = form.format(_truth(condition, truths), number)
         else:
             raise NotImplementedError(f"{name} has CasADi's operation {operation}, which is not known as C")
-        lines.append(f"w{made[0]} = {value};")
-        registers.add(made[0])
         constant = function.instruction_constant(k) if operation == casadi.OP_CONST else None
+        lines.append(_Line(f"w{made[0]} = {value};", made[0], given, constant is not None))
         _note(truths, made[0], operation in _TRUTH or constant in (0.0, 1.0))
         _note(infinite, made[0], constant is not None and math.isinf(constant))
-    variables = ", ".join(f"w{i}" for i in sorted(registers))
     arguments = [f"const real *restrict {pointer}, int64_t s{pointer}" for pointer, _ in inputs]
     arguments += [f"real *restrict {pointer}, int64_t s{pointer}" for pointer, _ in outputs]
-    body = "\n        ".join([f"real {variables};" if registers else "", *lines])
+    if len(lines) <= _LONGEST:
+        return _loop(name, arguments, lines)
+    return _in_pieces(name, [pointer for pointer, _ in (*inputs, *outputs)], arguments, lines)
+
+
+def _loop(name: str, arguments: Sequence[str], lines: Sequence[_Line], kind: str = "") -> str:
+    """A C function that computes lines for every lane."""
+    registers = {i for line in lines for i in (*line.given, line.made) if i is not None}
+    variables = ", ".join(f"w{i}" for i in sorted(registers))
+    body = "\n        ".join([f"real {variables};" if registers else "", *(line.text for line in lines)])
     return (
-        f"static void {name}({', '.join(arguments)}) {{\n"
+        f"static {kind}void {name}({', '.join(arguments)}) {{\n"
         f"    #pragma omp simd\n    for (int k = 0; k < LANES; ++k) {{\n        {body}\n    }}\n}}\n"
+    )
+
+
+def _in_pieces(name: str, pointers: Sequence[str], arguments: Sequence[str], lines: Sequence[_Line]) -> str:
+    """The same as C functions one after another, because the time of compilers grows with the square of the length.
+
+    Registers that a later piece reads are kept in memory between them.
+    """
+    pieces = [lines[first : first + _PIECE] for first in range(0, len(lines), _PIECE)]
+    needed: list[set[int]] = [set() for _ in pieces]  # after each piece
+    begins: list[set[int]] = []  # what each piece reads before it writes it
+    for piece in pieces:
+        written: set[int] = set()
+        begins.append(set())
+        for line in piece:
+            begins[-1].update(i for i in line.given if i not in written)
+            written.update(() if line.made is None else (line.made,))
+    for i in reversed(range(len(pieces) - 1)):
+        needed[i] = begins[i + 1] | (needed[i + 1] - {line.made for line in pieces[i + 1]})
+    kept = "kept[{0} * LANES + k]"
+    functions, constants = [], {}  # of registers that hold one at the end of a piece, its line
+    for i, piece in enumerate(pieces):
+        before = [constants.get(r, _Line(f"w{r} = {kept.format(r)};", r, (), False)) for r in sorted(begins[i])]
+        last = {line.made: line for line in piece if line.made is not None}
+        constants = {r: line for r, line in (constants | last).items() if line.constant}
+        stored = sorted(needed[i] & set(last) - set(constants))
+        after = [_Line(f"{kept.format(r)} = w{r};", None, (r,), False) for r in stored]
+        whole = [*before, *piece, *after]
+        functions.append(_loop(f"{name}_{i}", [*arguments, "real *restrict kept"], whole, "__attribute__((noinline)) "))
+    given = ", ".join(f"{pointer}, s{pointer}" for pointer in pointers)
+    calls = "\n    ".join(f"{name}_{i}({given}, kept);" for i in range(len(pieces)))
+    size = 1 + max(line.made for line in lines if line.made is not None)
+    return "".join(functions) + (
+        f"static void {name}({', '.join(arguments)}) {{\n    real kept[{size} * LANES];\n    {calls}\n}}\n"
     )
 
 

@@ -24,7 +24,7 @@ SIMD = (
 )
 """Flags of the compiler for functions of `LANES` stages."""
 
-LONG = (*SIMD, "-O1")
+LONG = (*SIMD, "-O1", "-fno-ivopts")
 """The same for tens of thousands of operations, on which the compiler would spend twice the time."""
 
 _log = logging.getLogger(__name__)
