@@ -28,6 +28,7 @@ from ballbot_gym.robot import (
     named_robot,
     read_urdf,
     register_robot,
+    urdf_text,
 )
 from ballbot_gym.rollout import Controller, Episode, rollout
 from ballbot_gym.seeding import spawned
@@ -85,6 +86,7 @@ __all__ = [
     "rollout",
     "spawned",
     "then_stay",
+    "urdf_text",
 ]
 
 __getattr__ = exports(

@@ -110,6 +110,7 @@ def measure(robot: Ballbot, made: Recorded, readings: Readings) -> list[dict[str
     result = identify(robot, [log], _KNOWN)
     rows = [row_of("seconds of one core", time.process_time() - begin, np.nan)]
     named = sum("glitch" in each for each in result.findings), any("jitters" in each for each in result.findings)
+    rows.append(row_of("rounds of the search", result.found.rounds, np.nan))
     rows += [row_of("columns with glitches named", named[0], np.nan), row_of("jitter named", float(named[1]), np.nan)]
     truths = {"delay": made.delay} | {name: value_of(made.robot, name) for name in _TRUE if has(made.robot, name)}
     for each in result.found.estimates:

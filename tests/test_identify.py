@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ballbot_baselines import LqrController
 from ballbot_baselines.identification.checks import Predictions
 from ballbot_baselines.identification.estimate import Found, Problem, _widening
 from ballbot_baselines.identification.identify import identify
@@ -16,6 +17,7 @@ from ballbot_baselines.identification.logs import Log, LogError
 from ballbot_baselines.identification.record import Recorded, Waves, record
 from ballbot_baselines.identification.scores import _scores
 from ballbot_gym import Randomization, named_robot
+from ballbot_gym.env import make_task
 from ballbot_gym.robot import Ballbot, read_urdf
 from ballbot_train.commands.identify import identify as command
 
@@ -500,3 +502,18 @@ def test_the_regret_of_the_controller_is_that_of_parts_of_a_log_that_end_at_rest
     assert abs(score.regret) < 0.005  # LQR is the optimum of small motions; the filter's states are not exact
     driven = record(ROBOT, 6.0, None, None, "rk4")
     assert _scores(found, driven.readings) == []
+
+
+def test_a_controller_of_ones_own_drives_the_robot_that_the_seed_draws_from_where_it_is_put() -> None:
+    varied, start = Randomization(body_mass=(0.8, 1.2), position_noise=0.005), np.zeros(8)
+    start[0] = 0.5
+    lqr = LqrController(make_task("stabilize", ROBOT, control_dt=0.01), ROBOT)
+    made = record(ROBOT, 5.0, None, varied, "rk4", 3, lqr, start)
+    assert made.robot == record(ROBOT, 5.0, Waves.still(), varied, "rk4", 3).robot != ROBOT
+    np.testing.assert_array_equal(made.trajectory.x[0], start)
+    assert np.abs(made.trajectory.x[-1]).max() < 0.02
+    # the log has what the controller saw: the true states with noise
+    error = made.readings.y[:, 0] - made.trajectory.x[:-1, 0]
+    assert 0.003 < error.std() < 0.007
+    with pytest.raises(ValueError, match="a motion or a controller"):
+        record(ROBOT, 5.0, Waves.still(), varied, "rk4", 3, lqr)

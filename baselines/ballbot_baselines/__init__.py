@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from ballbot_baselines.feedback.nmpc import NmpcController
     from ballbot_baselines.feedback.trajopt import TrajoptController
     from ballbot_baselines.feedback.tvlqr import TvlqrController
+    from ballbot_baselines.identification.identify import identify
+    from ballbot_baselines.identification.logs import Log
+    from ballbot_baselines.identification.record import record
     from ballbot_baselines.optimum.find import certified_optimum, find_optima, find_optimum, plan_to_track
     from ballbot_baselines.optimum.measured import Regret, regret
     from ballbot_baselines.optimum.optimum import Optimum
@@ -58,6 +61,7 @@ __all__ = [
     "VARIANTS",
     "Backoff",
     "Controller",
+    "Log",
     "LqrController",
     "NmpcController",
     "Ocp",
@@ -73,7 +77,9 @@ __all__ = [
     "certified_optimum",
     "find_optima",
     "find_optimum",
+    "identify",
     "plan_to_track",
+    "record",
     "regret",
 ]
 
@@ -83,6 +89,9 @@ _MODULES = {
     "feedback.nmpc": ("NmpcController",),
     "feedback.trajopt": ("TrajoptController",),
     "feedback.tvlqr": ("TvlqrController",),
+    "identification.identify": ("identify",),
+    "identification.logs": ("Log",),
+    "identification.record": ("record",),
     "optimum.find": ("certified_optimum", "find_optima", "find_optimum", "plan_to_track"),
     "optimum.measured": ("Regret", "regret"),
     "optimum.optimum": ("Optimum",),

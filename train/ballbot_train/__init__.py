@@ -9,6 +9,7 @@ Everything that users need is imported from here. A module is imported only when
 | `load_policy` | loads a policy file as a Controller with `predict` |
 | `shipped_policies` | the policies that come with the package |
 | `export_onnx` | writes a policy as an ONNX file |
+| `export_c` | writes a policy or LQR as a C file, with the filter of a robot with wheels |
 | `BallbotVecEnv`, `RslVecEnv` | batched environments for Stable-Baselines3 and rsl-rl |
 | `RegretWrapper` | adds the regret of every episode to its `info` |
 | `RegretCallback` | measures the regret of a Stable-Baselines3 model while it trains |
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ballbot_train.learning.callbacks import RegretCallback
     from ballbot_train.learning.rsl import RslVecEnv
     from ballbot_train.learning.sb3 import BallbotVecEnv
+    from ballbot_train.policy.export_c import export_c
     from ballbot_train.policy.export_onnx import export_onnx
     from ballbot_train.policy.files import shipped_policies
     from ballbot_train.policy.network import load_policy
@@ -40,6 +42,7 @@ __all__ = [
     "certified_replay",
     "evaluate",
     "evaluate_fresh",
+    "export_c",
     "export_onnx",
     "load_policy",
     "shipped_policies",
@@ -54,6 +57,7 @@ _MODULES = {
     "certified_replay": "report.replay",
     "evaluate": "evaluation.evaluate",
     "evaluate_fresh": "evaluation.fresh",
+    "export_c": "policy.export_c",
     "export_onnx": "policy.export_onnx",
     "load_policy": "policy.network",
     "shipped_policies": "policy.files",

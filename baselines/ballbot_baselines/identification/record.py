@@ -13,6 +13,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import Ballbot, Randomization, Sensors
 from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
 
 Motion = Callable[[float], np.ndarray]
 """(3,) place, m, and heading, rad, at which the robot is asked to be at a time, s; only robots with wheels have a heading."""
@@ -37,6 +38,8 @@ class Recorded(NamedTuple):
     """s."""
     lean: float
     """The greatest, rad."""
+    trajectory: Trajectory
+    """The true states, and the forces that the robot applied."""
 
 
 class Waves(NamedTuple):
@@ -113,8 +116,10 @@ def record(
     randomization: Randomization | str | None = "real",
     physics: str | None = None,
     seed: int = 0,
+    controller: Controller | None = None,
+    start: np.ndarray | None = None,
 ) -> Recorded:
-    """Records a robot that LQR balances behind a filter; the controller is made for the nominal robot.
+    """Records a robot that LQR balances behind a filter, made for the nominal robot, or that a given controller drives.
 
     Robots without wheels report their state with the errors of the randomization. Robots with wheels report gyroscope,
     accelerometer and the angles of their wheels, with the errors of `ballbot_gym.robot.sensors`.
@@ -125,22 +130,26 @@ def record(
         motion: where it is asked to be; default, `Waves.driving`.
         randomization: what differs from the nominal robot, or a name in `TRACKS`.
         physics: same as in `BallbotEnv`.
-        seed: of what is drawn.
+        seed: of what is drawn; with the same seed and randomization it is the same robot.
+        controller: of Stabilize in steps of 1 / `RATE`, which acts on the readings instead of LQR, without a motion.
+        start: (n,) state in which the log begins; default, upright and at rest at the origin.
 
     Raises:
-        ValueError: the robot fell.
+        ValueError: the robot fell, or a controller is given and a motion too.
     """
+    if controller is not None and motion is not None:
+        raise ValueError("give a motion or a controller; the controller decides where the robot goes")
     motion = Waves.driving(robot, np.random.default_rng(seed)) if motion is None else motion
     senses, fields = bool(robot.SENSORS), {"duration": seconds, "control_dt": 1 / RATE, "arena_radius": 100.0}
     task = make_task("stabilize", robot, **fields)
     env = BallbotEnv(
         task, physics, randomization=randomization, robot=robot, observation="sensors" if senses else "state"
     )
-    driver: Any = _Driver(LqrController(task, robot), motion)
-    if senses or env.randomization.active:
+    driver: Any = _Driver(LqrController(task, robot), motion) if controller is None else controller
+    if controller is None and (senses or env.randomization.active):
         driver = FilteredController(task, robot, "-ekf" if senses else "-adaptive-ekf", driver)
-    logger = _Logger(driver)
-    episode = rollout(env, logger, seed=seed, options={"state": np.zeros(robot.state_size)})
+    logger, begin = _Logger(driver), np.zeros(robot.state_size) if start is None else start
+    episode = rollout(env, logger, seed=seed, options={"state": begin})
     drawn = env.get_state().drawn
     env.close()
     if episode.failure:
@@ -151,7 +160,7 @@ def record(
     true = env.randomization.robot(robot, drawn) if drawn else robot
     delay = float(drawn[5]) / RATE if drawn else 0.0
     readings, strength = _readings(robot, task, logger), true.force_limit / robot.force_limit
-    return Recorded(readings, true, strength, delay, episode.peak_tilt)  # pyright: ignore[reportArgumentType]
+    return Recorded(readings, true, strength, delay, episode.peak_tilt, episode.trajectory)  # pyright: ignore[reportArgumentType]
 
 
 def _readings(robot: Ballbot, task: Task, logger: _Logger) -> Readings:
