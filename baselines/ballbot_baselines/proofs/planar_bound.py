@@ -188,7 +188,7 @@ def _quadratic(certificate: PlanarBound) -> list[list[Fraction]]:
 def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
     """Upper bounds of the quadratic part of V in the goal, if it is convex, and of the rest of V there."""
     inverse, quadratic = _inverse([[Fraction(each) for each in row] for row in certificate.t]), _quadratic(certificate)
-    goal = [Fraction(each) * Fraction(1 + 1e-9) for each in (0.1, float(np.deg2rad(2)), 0.1, 0.1)]
+    goal = [Fraction(each) * Fraction(1 + 1e-9) for each in Stabilize.AT_REST]
     signs = itertools.product((1, -1), repeat=4)
     corners = [[sum(row[j] * s[j] * goal[j] for j in range(4)) for row in inverse] for s in signs]
     # a convex function is largest in a corner
