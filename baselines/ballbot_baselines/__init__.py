@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ballbot_baselines.feedback.trajopt import TrajoptController
     from ballbot_baselines.feedback.tvlqr import TvlqrController
     from ballbot_baselines.optimum.find import certified_optimum, find_optima, find_optimum, plan_to_track
+    from ballbot_baselines.optimum.lower_bound import PlanarBound
     from ballbot_baselines.optimum.measured import Regret, regret
     from ballbot_baselines.optimum.optimum import Optimum
     from ballbot_baselines.solvers.guess import along_path
@@ -64,6 +65,7 @@ __all__ = [
     "OcpSolver",
     "Optimum",
     "PlanError",
+    "PlanarBound",
     "Regret",
     "Solution",
     "StateFromSensors",
@@ -84,6 +86,7 @@ _MODULES = {
     "feedback.trajopt": ("TrajoptController",),
     "feedback.tvlqr": ("TvlqrController",),
     "optimum.find": ("certified_optimum", "find_optima", "find_optimum", "plan_to_track"),
+    "optimum.lower_bound": ("PlanarBound",),
     "optimum.measured": ("Regret", "regret"),
     "optimum.optimum": ("Optimum",),
     "solvers.guess": ("along_path",),
