@@ -1,10 +1,10 @@
 """Fits the lower bound of the cost of planar Stabilize that `ballbot prove --planar` checks, and measures it.
 
-Nobody has to trust the fit: it makes `planar_bound.json`, and the check proves what that file says. V is a polynomial of
+Nobody has to trust the fit: it makes `lower_bound.json`, and the check proves what that file says. V is a polynomial of
 degree 6 in z. In samples (z, u) it should obey (V(F(z, u)) − V(z))/dt + l(z, u) = margin · l(z, u) for the worst force u.
 A fit by least squares for given forces, and the worst forces of that fit, are computed in turn.
 
-It writes planar_bound.json. It prints how much the inequality leaves in fresh samples, what share of the task's planar
+It writes lower_bound.json. It prints how much the inequality leaves in fresh samples, what share of the task's planar
 starts the bound covers, and what share of the optimal cost it is in random states.
 """
 
@@ -17,13 +17,14 @@ import numpy as np
 import tyro
 from scipy.linalg import eigh
 
-from ballbot_baselines import find_optima
-from ballbot_baselines.proofs.planar_bound import _PLANE, PlanarBound, _in_goal
+from ballbot_baselines import PlanarBound, find_optima
+from ballbot_baselines.proofs.planar_bound import _in_goal
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import files
 from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.tasks import Stabilize
 
+_PLANE = [0, 2, 4, 6]  # position, lean, speed and lean rate of a state
 TASK, ROBOT = Stabilize(), named_robot(PAPER)
 COST = np.array([TASK.position_weight, *[TASK.rest_weight] * 3])
 KNOTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
@@ -145,7 +146,7 @@ def main(
     samples: int = 5000,
     rounds: int = 4,
     states: int = 200,
-    out: Path = Path("runs/planar_bound.json"),
+    out: Path = Path("runs/lower_bound.json"),
 ) -> None:
     """Fits the bound.
 

@@ -13,7 +13,8 @@ from ballbot_gym.robot import named_robot
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines.proofs.planar_bound import PlanarBound, _Box, _check_numbers, _code, _problem, check_parts
+from ballbot_baselines import PlanarBound, find_optima, find_optimum, regret
+from ballbot_baselines.proofs.planar_bound import _Box, _check_numbers, _code, _problem, check_parts
 
 TERMS, VARIABLES, DIGITS = 126, 5, 50
 
@@ -103,8 +104,6 @@ def test_numbers_that_the_theorem_does_not_allow_are_refused(certificate: Planar
 
 
 def test_no_optimum_costs_less_than_the_bound(certificate: PlanarBound) -> None:
-    from ballbot_baselines import find_optima
-
     task, robot, x0 = make_task("stabilize"), named_robot("paper"), np.zeros((12, 8))
     x0[:, ::2] = np.random.default_rng(2).uniform(-1, 1, (12, 4)) * (0.15, 0.05, 0.2, 0.3)
     bound = certificate.bound(x0[:, ::2], task.steps)
@@ -113,3 +112,41 @@ def test_no_optimum_costs_less_than_the_bound(certificate: PlanarBound) -> None:
     for optimum, least in zip(find_optima(task, robot, x0, np.zeros((len(x0), 0))), bound, strict=True):
         assert optimum is not None
         assert 0.9 * optimum.cost < least <= optimum.cost
+
+
+START = np.array([0.2, 0.0, 0.05, 0.0, 0.1, 0.0, 0.0, 0.0])
+
+
+def test_only_planar_starts_of_the_same_problem_have_a_bound() -> None:
+    bound, task, robot = PlanarBound.stored(), make_task("stabilize"), named_robot("paper")
+    least = bound.of_episode(task, robot, START)
+    assert least > 0
+    assert bound.of_episode(task, robot, np.roll(START, 1)) == least  # in the other plane
+    assert bound.of_episode(make_task("stabilize", start_lean=0.1), robot, START) == least
+    assert bound.of_episode(make_task("stabilize", duration=1.0), robot, START) < least
+    others = [
+        (make_task("stabilize", effort_weight=1e-3), robot, START),
+        (make_task("weave"), robot, START),
+        (task, named_robot("rolling"), START),
+        (task, robot, START + 0.01),
+        (task, robot, 10 * START),
+        (task, robot, 0 * START),
+    ]
+    assert np.isnan([bound.of_episode(*other) for other in others]).all()
+
+
+def test_both_planes_have_the_same_motions() -> None:
+    robot, rng = named_robot("paper"), np.random.default_rng(0)
+    x, u = np.zeros((100, 8)), np.zeros((100, 2))
+    x[:, ::2], u[:, 0] = rng.uniform(-1, 1, (100, 4)), rng.uniform(-350, 350, 100)
+    one, other = (robot.step(np.roll(x, n, axis=1), np.roll(u, n, axis=1), 0.02) for n in (0, 1))
+    assert np.abs(np.roll(one, 1, axis=1) - other).max() < 1e-14
+    assert not one[:, 1::2].any()
+
+
+def test_a_planar_motion_has_a_regret_that_is_proven() -> None:
+    task, robot = make_task("stabilize"), named_robot("paper")
+    optimum = find_optimum(task, robot, START, np.zeros(0))
+    found = regret(optimum.trajectory, task, robot)
+    assert found.proven == pytest.approx(optimum.cost / PlanarBound.stored().of_episode(task, robot, START) - 1)
+    assert found.regret <= found.proven < 0.1

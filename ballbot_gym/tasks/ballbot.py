@@ -26,6 +26,8 @@ class BallbotTask(Task):
     heading_weight: float = field(default=0.0, repr=False)
     """Weight of 2 (1 − cos ψ), which is ψ² near 0, where ψ is the yaw of a robot with wheels, 1/s."""
 
+    AT_REST: ClassVar[tuple[float, float, float, float]] = (0.1, math.radians(2), 0.1, 0.1)
+    """Tolerances of a goal at rest: distance, m; tilt, rad; speed, m/s; lean rate, rad/s."""
     margin_names: ClassVar[tuple[str, ...]] = ("tilt",)
     NOT_THE_PROBLEM: ClassVar[frozenset[str]] = Task.NOT_THE_PROBLEM | {"arena_radius", "arena_factor"}
     MAY_BE_ZERO: ClassVar[frozenset[str]] = frozenset({"heading_weight"})
@@ -82,16 +84,18 @@ class BallbotTask(Task):
         x_centre, y_centre, radius = self.arena(c)
         return (*self.margins(x, c), (radius * radius - squared(px - x_centre, py - y_centre)) / (2 * radius))
 
-    @staticmethod
-    def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
+    @classmethod
+    def at_rest(cls, x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
         """The `goal` of a task that ends at rest at a point, m.
 
-        All numbers are ≤ 0 within 0.1 m of it, below 0.1 m/s, 2° of tilt and 0.1 rad/s of lean rate.
+        All numbers are ≤ 0 where nothing exceeds `AT_REST`: within 0.1 m of the point, below 0.1 m/s, 2° of tilt and
+        0.1 rad/s of lean rate.
         """
         px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
+        distance, lean, speed, lean_rate = cls.AT_REST
         return (
-            squared(px - x_goal, py - y_goal) / 0.1**2 - 1,
-            squared(vx, vy) / 0.1**2 - 1,
-            (1 - cos_tilt(x)) / (1 - math.cos(math.radians(2))) - 1,
-            squared(gamma_dot, theta_dot) / 0.1**2 - 1,
+            squared(px - x_goal, py - y_goal) / distance**2 - 1,
+            squared(vx, vy) / speed**2 - 1,
+            (1 - cos_tilt(x)) / (1 - math.cos(lean)) - 1,
+            squared(gamma_dot, theta_dot) / lean_rate**2 - 1,
         )

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ballbot_baselines.identification.logs import Log
     from ballbot_baselines.identification.record import record
     from ballbot_baselines.optimum.find import certified_optimum, find_optima, find_optimum, plan_to_track
+    from ballbot_baselines.optimum.lower_bound import PlanarBound
     from ballbot_baselines.optimum.measured import Regret, regret
     from ballbot_baselines.optimum.optimum import Optimum
     from ballbot_baselines.solvers.guess import along_path
@@ -68,6 +69,7 @@ __all__ = [
     "OcpSolver",
     "Optimum",
     "PlanError",
+    "PlanarBound",
     "Regret",
     "Solution",
     "StateFromSensors",
@@ -93,6 +95,7 @@ _MODULES = {
     "identification.logs": ("Log",),
     "identification.record": ("record",),
     "optimum.find": ("certified_optimum", "find_optima", "find_optimum", "plan_to_track"),
+    "optimum.lower_bound": ("PlanarBound",),
     "optimum.measured": ("Regret", "regret"),
     "optimum.optimum": ("Optimum",),
     "solvers.guess": ("along_path",),

@@ -1,11 +1,13 @@
 """The regret of any trajectory, by any controller: its cost minus that of the optimum from the same start."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ballbot_baselines.optimum.find import find_optimum
+from ballbot_baselines.optimum.lower_bound import PlanarBound
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_gym.checks import finite_array
 from ballbot_gym.env import make_task, robot_of
@@ -25,6 +27,7 @@ class Regret:
     | field | meaning |
     |---|---|
     | `regret` | cost / optimum.cost − 1 |
+    | `proven` | the regret is proven to be at most this, among motions in the start's vertical plane; else NaN |
     | `cost` | as an env counts it: on the task's control steps, up to the episode's end, the price of a failure included |
     | `optimum` | the optimum from the trajectory's first state |
     | `success` | whether the episode reaches its goal |
@@ -34,7 +37,7 @@ class Regret:
     | `force_excess` | by how much the largest recorded force exceeds the force limit, N; 0 if none does |
 
     Defects of an optimum are below 1e-6. If they are not small, this robot cannot perform the motion, and the regret has no
-    meaning.
+    meaning. `proven` is a number for starts of Stabilize in a vertical plane and near rest: see `PlanarBound`.
     """
 
     regret: float
@@ -45,6 +48,7 @@ class Regret:
     duration: float
     defects: np.ndarray
     force_excess: float
+    proven: float = math.nan
 
 
 def regret(
@@ -98,6 +102,7 @@ def regret(
         duration=end * task.control_dt,
         defects=_defects(params, moved),
         force_excess=max(0.0, float(np.abs(moved.u).max()) - params.force_limit),
+        proven=cost / PlanarBound.stored().of_episode(task, params, x[0]) - 1,
     )
 
 

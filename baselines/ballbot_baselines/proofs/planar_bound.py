@@ -1,17 +1,15 @@
 """A proven lower bound of the cost of Stabilize in a vertical plane: `ballbot prove --planar`. The check is `planar_bound.c`.
 
-The bound is a polynomial V of four variables, stored in `planar_bound.json` with all other numbers of the theorem. Nothing
-of it is trusted: this module computes in exact fractions what the theorem in `planar_bound.c` asks of the goal, of the
-schedule a_k and of the range of states. Then it checks the inequality of the step in boxes that cover this range.
+The bound is a polynomial V of four variables, stored in `optimum/lower_bound.json` with all other numbers of the theorem.
+Nothing of it is trusted: this module computes in exact fractions what the theorem in `planar_bound.c` asks of the goal, of
+the schedule a_k and of the range of states. Then it checks the inequality of the step in boxes that cover this range.
 """
 
 import ctypes
 import itertools
-import json
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -19,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from ballbot_baselines.optimum.lower_bound import PlanarBound
 from ballbot_gym import machine_code
 from ballbot_gym.robot import default_params
 from ballbot_gym.tasks.stabilize import Stabilize
 
 _PAIRS = list(itertools.combinations_with_replacement(range(4), 2))
-_PLANE = [0, 2, 4, 6]  # position, lean, speed and lean rate of a state
 _KNOTS, _SIZES = 16, (10, 100, 1000)
 _WIDEST = 1024.0
 _FLAGS = ("-O3", "-march=native")
@@ -55,65 +53,6 @@ class _Box(ctypes.Structure):
         ("face", ctypes.c_int64),
         ("depth", ctypes.c_int64),
     )
-
-
-@dataclass(frozen=True)
-class PlanarBound:
-    """The numbers of the theorem in planar_bound.c."""
-
-    t: list[list[float]]
-    """(4, 4) upper triangular: states (position, lean, speed, lean rate) are T z."""
-    gain: list[float]
-    """(4,) forces are near gain · z. Any numbers are right; good ones save boxes."""
-    exponents: list[list[int]]
-    """(m, 4) of the monomials of V, of degree 2, 4 or 6."""
-    coefficients: list[float]
-    """(m,) of these monomials."""
-    rho: float
-    """The bound holds where V < rho."""
-    outer: float
-    """V is only used where its quadratic part is at most this."""
-    share: float
-    """V is at least this share of its quadratic part."""
-    delta: float
-    """V is at most this in the goal."""
-    knots: list[tuple[float, float]]
-    """(a, r): the schedule a_k, by its slopes at some a. The last a is 1."""
-
-    @classmethod
-    def stored(cls) -> "PlanarBound":
-        """The one of the package."""
-        return cls(**json.loads(Path(__file__).with_name("planar_bound.json").read_text(encoding="utf-8")))
-
-    def value(self, x: np.ndarray, degree: int = 6) -> np.ndarray:
-        """(n,) V of states (n, 4), rounded, or its part up to a degree."""
-        z = np.linalg.solve(np.array(self.t), x.T)[:, :, None]
-        exponents = np.array(self.exponents).T
-        kept = exponents.sum(0) <= degree
-        return np.prod(z ** exponents[:, None, kept], 0) @ np.array(self.coefficients)[kept]
-
-    def bound(self, x: np.ndarray, steps: int) -> np.ndarray:
-        """(n,) lower bounds of the cost of successful episodes of some steps from states (n, 4); NaN where none is proven."""
-        v, a = self.value(x), self.schedule(steps)
-        bound = np.maximum(a * v, v - self.delta)
-        inside = (self.value(x, 2) < self.outer) & (v < self.rho) & (bound <= self.rho - self.delta)
-        return np.where(inside, bound, np.nan)
-
-    def until(self) -> list[float]:
-        """For each knot, below which V the inequality is needed with it: δ/(1 − a) for the largest a that can follow it."""
-        ahead = [a for a, _ in self.knots[1:]] + [1.0]
-        following = [a + self._dt() * max(r for _, r in self.knots) + 1e-9 for a in ahead]
-        return [self.delta / (1 - a) * (1 + 1e-9) if a < 1 else float("inf") for a in following]
-
-    def schedule(self, steps: int) -> float:
-        """a_n for n steps, rounded down."""
-        slopes, a = np.array(self.knots), 0.0
-        for _ in range(steps):
-            a = min(1.0, a + self._dt() * float(np.interp(a, slopes[:, 0], slopes[:, 1])) * (1 - 1e-12))
-        return a - 1e-9 * (a < 1)
-
-    def _dt(self) -> float:
-        return Stabilize().control_dt
 
 
 def _problem(certificate: PlanarBound) -> _Problem:
@@ -188,7 +127,7 @@ def _quadratic(certificate: PlanarBound) -> list[list[Fraction]]:
 def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
     """Upper bounds of the quadratic part of V in the goal, if it is convex, and of the rest of V there."""
     inverse, quadratic = _inverse([[Fraction(each) for each in row] for row in certificate.t]), _quadratic(certificate)
-    goal = [Fraction(each) * Fraction(1 + 1e-9) for each in (0.1, float(np.deg2rad(2)), 0.1, 0.1)]
+    goal = [Fraction(each) * Fraction(1 + 1e-9) for each in Stabilize.AT_REST]
     signs = itertools.product((1, -1), repeat=4)
     corners = [[sum(row[j] * s[j] * goal[j] for j in range(4)) for row in inverse] for s in signs]
     # a convex function is largest in a corner

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import find_optimum
+from ballbot_baselines import PlanarBound, find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER
 from ballbot_gym.tasks import TASKS
@@ -66,4 +66,11 @@ def optimize(
         ["search, s", f"{optimum.seconds:.3f}"],
     ]
     print_table(env.task.id, ["", ""], rows)
+    least = PlanarBound.stored().of_episode(env.task, env.params, info["state"])
+    if not math.isnan(least):
+        console.print(
+            f"No successful motion in the vertical plane of this start costs less than {least:.6f}, so its regret is at most "
+            f"{optimum.cost / least - 1:.1%}. `ballbot prove --planar` proves it.",
+            soft_wrap=True,
+        )
     console.print(f"trajectory: {path}\nfigure: {picture}")

@@ -2,8 +2,9 @@
 
 import time
 
+from ballbot_baselines import PlanarBound
 from ballbot_baselines.proofs.minima import _lines, _summary
-from ballbot_baselines.proofs.planar_bound import PlanarBound, check_parts
+from ballbot_baselines.proofs.planar_bound import check_parts
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.machine_code import NoMachineCodeError
