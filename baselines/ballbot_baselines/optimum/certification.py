@@ -16,7 +16,7 @@ from ballbot_baselines.optimum.find import find_optimum
 from ballbot_baselines.optimum.guesses import COARSE
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.compiled import LANES
-from ballbot_baselines.solvers.shooting import Backoff
+from ballbot_baselines.solvers.shooting import Backoff, Shooting
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
 from ballbot_gym.env import make_task
@@ -26,6 +26,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 _SLALOM_GUESSES = 256  # random ones; of a robot that has to grip, one of thirty may lead to a solution
+_GUESSES = 200  # random ones, where the other searches do not come to a stored cost
 
 AT_ONCE = LANES
 """Episodes whose second searches share the processor's lanes."""
@@ -196,3 +197,42 @@ def arrays(entries: Mapping[int, EvaluationSet | str], task: Task, params: Robot
         "failed": np.array(list(failed), np.int64),
         "errors": np.array(list(failed.values()), str),
     }
+
+
+def _motion_again(
+    task: Task, robot: Robot, known: EvaluationSet, i: int, found: Optimum | None, same: float
+) -> Trajectory:
+    """The motion of a certified episode whose forces are not stored.
+
+    Args:
+        task: the problem.
+        robot: whose optima the set contains.
+        known: the certified set.
+        i: number of the episode.
+        found: an optimum of the episode that may be it.
+        same: the largest difference of the motion's cost from the stored one; if no search finds one, it is the last motion.
+
+    Raises:
+        PlanError: no search found a motion.
+    """
+    x0, c = known.states[i], known.constants[i]
+    shooting = Shooting(task, robot, x0, c, Backoff())
+
+    def searches() -> Iterator[Optimum | None]:
+        yield found
+        yield find_optimum(task, robot, x0, c, twice=True)
+        yield batched.multistart(task, robot, x0[None], c[None], _GUESSES)[0][0]
+
+    motion = None
+    for optimum in searches():
+        if optimum is None:
+            continue
+        x, u = optimum.trajectory.x, optimum.trajectory.u
+        near = shooting.solve_to_the_end(x, u / robot.force_limit, near=True)[-1]
+        motion = Trajectory(optimum.trajectory.t, near.states, robot.force_limit * near.inputs)
+        same_length = len(u) == round(known.durations[i] / task.control_dt)
+        if near.is_optimal and same_length and abs(near.cost - known.costs[i]) < same:
+            break
+    if motion is None:
+        raise PlanError("no search found a motion")
+    return motion

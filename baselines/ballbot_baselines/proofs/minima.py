@@ -10,17 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum.batched import multistart
-from ballbot_baselines.optimum.find import find_optima, find_optimum
-from ballbot_baselines.optimum.optimum import Optimum
+from ballbot_baselines.optimum.certification import _motion_again
+from ballbot_baselines.optimum.find import find_optima
 from ballbot_baselines.proofs.local_minimum import _NotProvenError, _Problem, _prove
 from ballbot_baselines.proofs.stationary import _stationary
-from ballbot_baselines.solvers.shooting import Backoff, Shooting
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, Robot, named_robot
+from ballbot_gym.robot import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
-from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 NEAR = 5e-6
@@ -28,7 +25,6 @@ NEAR = 5e-6
 SAME_COST = 1e-5
 """Largest difference between a stored cost and that of the minimum: what these reserves cost is less."""
 _BELOW = 1e-9  # by which a stored cost may be too low, from rounding and the tolerance of solvers
-_GUESSES = 200  # random ones, where the other searches do not come to the stored cost
 
 
 def _enclosed(problem: _Problem, motion: Trajectory, cost: float, stored: bool = True) -> dict[str, Any]:
@@ -76,37 +72,12 @@ def _lines(name: str, indices: Sequence[int]) -> Iterator[dict[str, Any]]:
         began, cost, stored = time.perf_counter(), float(known.costs[i]), i < len(known.trajectories)
         line: dict[str, Any] = {"task": name, "episode": i, "proven": 0, "why_not": ""}
         try:
-            motion = known.trajectories[i] if stored else _again(task, robot, known, i, found[i])
+            motion = known.trajectories[i] if stored else _motion_again(task, robot, known, i, found[i], SAME_COST)
             line |= _enclosed(_Problem(task, robot, tuple(known.constants[i].tolist())), motion, cost, stored)
             line["proven"] = 1
         except (ArithmeticError, PlanError) as error:
             line["why_not"] = str(error)
         yield line | {"seconds": time.perf_counter() - began}
-
-
-def _again(task: Task, robot: Robot, known: certified.EvaluationSet, i: int, found: Optimum | None) -> Trajectory:
-    """The motion of a certified episode whose forces are not stored: of the first search that comes to the stored cost."""
-    x0, c = known.states[i], known.constants[i]
-    episode = Shooting(task, robot, x0, c, Backoff())
-
-    def searches() -> Iterator[Optimum | None]:
-        yield found
-        yield find_optimum(task, robot, x0, c, twice=True)
-        yield multistart(task, robot, x0[None], c[None], _GUESSES)[0][0]
-
-    motion = None
-    for optimum in searches():
-        if optimum is None:
-            continue
-        x, u = optimum.trajectory.x, optimum.trajectory.u
-        near = episode.solve_to_the_end(x, u / robot.force_limit, near=True)[-1]
-        motion = Trajectory(optimum.trajectory.t, near.states, robot.force_limit * near.inputs)
-        same_length = len(u) == round(known.durations[i] / task.control_dt)
-        if near.is_optimal and same_length and abs(near.cost - known.costs[i]) < SAME_COST:
-            break
-    if motion is None:
-        raise PlanError("no search found a motion")
-    return motion
 
 
 def _summary(name: str, rows: Sequence[dict[str, Any]]) -> str:
