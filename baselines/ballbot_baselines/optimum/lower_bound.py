@@ -29,7 +29,7 @@ class PlanarBound:
     gain: list[float]
     """(4,) forces are near gain · z. Any numbers are right; good ones save boxes."""
     exponents: list[list[int]]
-    """(m, 4) of the monomials of V in z, of degree 2, 4 or 6."""
+    """(m, 4) of the monomials of V in z, of degree 2, 4, 6 or 8."""
     coefficients: list[float]
     """(m,) of these monomials."""
     rho: float
@@ -69,7 +69,7 @@ class PlanarBound:
         least = float("nan") if plane is None else float(self.bound(plane[None], task.steps)[0])
         return least if least > 0 else float("nan")
 
-    def value(self, x: np.ndarray, degree: int = 6) -> np.ndarray:
+    def value(self, x: np.ndarray, degree: int = 8) -> np.ndarray:
         """(n,) V of planar states (n, 4), rounded, or its part up to a degree."""
         z = np.linalg.solve(np.array(self.t), x.T)[:, :, None]
         exponents = np.array(self.exponents).T

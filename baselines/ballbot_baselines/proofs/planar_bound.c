@@ -1,7 +1,7 @@
 /* Checks a lower bound of the cost of every successful episode of Stabilize in a vertical plane, from V's coefficients alone.
 
 States are x = (position, lean, speed, lean rate) = T z, forces u. F is a control step as the environment computes it: two RK4
-steps of dt/2 with the force held. l is the cost rate. V is an even polynomial of degree at most 6 in z, and V2 its quadratic
+steps of dt/2 with the force held. l is the cost rate. V is an even polynomial of degree at most 8 in z, and V2 its quadratic
 part, which is positive definite. With D = {V2 <= outer, V < rho} and k control steps left, let
 
     W_k(x) = min(max(V(x) - delta, a_k V(x)), rho - delta) in D, else rho - delta,   a_0 = 0,  a_k+1 = min(1, a_k + dt r(a_k)),
@@ -49,7 +49,7 @@ static real where(mask k, real a, real b) { return (real)((k & (mask)a) | (~k & 
 typedef struct {
     double mass, moment, inertia, gravity, dt, limit, reach[4], state_cost[4], force_cost; /* reach: of position and lean, and 0 */
     double t[4][4], gain[4], widest, rho, outer, share, a[KNOTS], r[KNOTS], until[KNOTS]; /* |w| <= widest in the boxes */
-    double c2[10], c4[10][10], c6[10][10][10]; /* of z_i z_j, of z_i z_j z_k z_l and so on, by pairs i <= j <= k <= l ... */
+    double c2[10], c4[35], c6[35][10], c8[35][35]; /* of products of i <= j <= ... of z: the first two or four, then the rest */
     int64_t knots;
 } problem;
 static problem P;
@@ -190,25 +190,25 @@ static void pair_add(pair *out, double s, const pair *b) {
     add(&out->at, &out->at, s, &b->at), add(&out->change, &out->change, s, &b->change);
 }
 static void values(const model *sigma, const pair z[4], pair *v, pair *v2) {
-    static _Thread_local pair q[10], scaled[10], inner, middle, t;
-    int n = 0;
-    number(&v2->at, 0), number(&v2->change, 0);
+    static _Thread_local pair q[10], two[10], four[35], middle, rest, t, zero; /* two and four: of z, as q times sigma */
+    int n = 0, a = 0, of[4][4];
+    number(&zero.at, 0), number(&zero.change, 0), *v2 = zero;
     EACH(i, 4) for (int j = i; j < 4; j++, n++) {
-        pair_times(&q[n], &z[i], &z[j]), pair_add(v2, P.c2[n], &q[n]);
-        times(&scaled[n].at, sigma, &q[n].at), times(&scaled[n].change, sigma, &q[n].change);
+        of[i][j] = n, pair_times(&q[n], &z[i], &z[j]), pair_add(v2, P.c2[n], &q[n]);
+        times(&two[n].at, sigma, &q[n].at), times(&two[n].change, sigma, &q[n].change);
     }
-    *v = *v2;
-    EACH(a, 10) {
-        int any = 0;
-        number(&middle.at, 0), number(&middle.change, 0);
-        EACH(b, 10) {
-            int more = 0;
-            if (P.c4[a][b]) pair_add(&middle, P.c4[a][b], &scaled[b]), any = 1;
-            number(&inner.at, 0), number(&inner.change, 0);
-            EACH(c, 10) if (P.c6[a][b][c]) pair_add(&inner, P.c6[a][b][c], &scaled[c]), more = 1;
-            if (more) pair_times(&t, &scaled[b], &inner), pair_add(&middle, 1, &t), any = 1;
+    *v = *v2, n = 0;
+    EACH(i, 4) for (int j = i; j < 4; j++) for (int k = j; k < 4; k++) for (int l = k; l < 4; l++, n++)
+        pair_times(&four[n], &two[of[i][j]], &two[of[k][l]]);
+    EACH(i, 4) for (int j = i; j < 4; j++) {
+        middle = zero;
+        for (int k = j; k < 4; k++) for (int l = k; l < 4; l++, a++) {
+            rest = zero, rest.at.c[0] += P.c4[a];
+            EACH(b, 10) if (P.c6[a][b]) pair_add(&rest, P.c6[a][b], &two[b]);
+            EACH(b, 35) if (P.c8[a][b]) pair_add(&rest, P.c8[a][b], &four[b]);
+            pair_times(&t, &two[of[k][l]], &rest), pair_add(&middle, 1, &t);
         }
-        if (any) pair_times(&t, &q[a], &middle), pair_add(v, 1, &t);
+        pair_times(&t, &q[of[i][j]], &middle), pair_add(v, 1, &t);
     }
 }
 

@@ -22,8 +22,8 @@ from ballbot_gym import machine_code
 from ballbot_gym.robot import default_params
 from ballbot_gym.tasks.stabilize import Stabilize
 
-_PAIRS = list(itertools.combinations_with_replacement(range(4), 2))
-_KNOTS, _SIZES = 16, (10, 100, 1000)
+_PAIRS, _FOURS = (list(itertools.combinations_with_replacement(range(4), n)) for n in (2, 4))
+_KNOTS = 16
 _WIDEST = 1024.0
 _FLAGS = ("-O3", "-march=native")
 
@@ -39,7 +39,10 @@ class _Problem(ctypes.Structure):
         ("gain", ctypes.c_double * 4),
         *((name, ctypes.c_double) for name in ("widest", "rho", "outer", "share")),
         *((name, ctypes.c_double * _KNOTS) for name in ("a", "r", "until")),
-        *((f"c{2 * n + 2}", ctypes.c_double * size) for n, size in enumerate(_SIZES)),
+        ("c2", ctypes.c_double * 10),
+        ("c4", ctypes.c_double * 35),
+        ("c6", ctypes.c_double * 350),
+        ("c8", ctypes.c_double * 1225),
         ("knots", ctypes.c_int64),
     )
 
@@ -72,9 +75,13 @@ def _problem(certificate: PlanarBound) -> _Problem:
     for i, ((a, r), until) in enumerate(zip(certificate.knots, certificate.until(), strict=True)):
         out.a[i], out.r[i], out.until[i] = a, r, until
     for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
-        factors = [i for i in range(4) for _ in range(e[i])]
-        pairs = [_PAIRS.index((i, j)) for i, j in zip(factors[::2], factors[1::2], strict=True)]
-        getattr(out, f"c{len(factors)}")[sum(p * 10 ** (len(pairs) - 1 - n) for n, p in enumerate(pairs))] = c
+        factors = tuple(i for i in range(4) for _ in range(e[i]))
+        degree, head, tail = len(factors), factors[:4], factors[4:]
+        place = _PAIRS.index(head) if degree == 2 else _FOURS.index(head)
+        if tail:
+            rest = _PAIRS if degree == 6 else _FOURS
+            place = place * len(rest) + rest.index(tail)
+        getattr(out, f"c{degree}")[place] = c
     return out
 
 
