@@ -128,6 +128,18 @@ def test_processes_that_compile_at_once_all_get_a_whole_library(folder):
 
 @posix
 @needs_compiler
+def test_compilers_other_than_gcc_get_no_setting_that_only_gcc_knows(fake_compiler, caplog):
+    fake_compiler(
+        b'#!/bin/sh\n[ "$1" = --version ] && echo "clang version 19" && exit 0\n'
+        b'case "$*" in *--param*|*-fira-*) echo "unknown argument" >&2; exit 1;; esac\nexec cc "$@"\n'
+    )
+    for function in compiled.in_lanes("powers", powers()):
+        assert not is_interpreted(function)
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+@posix
+@needs_compiler
 def test_of_processes_that_need_a_library_at_once_one_compiles_it(folder, tmp_path, monkeypatch):
     program, runs = tmp_path / "slow-compiler", tmp_path / "runs"
     program.write_text(f'#!/bin/sh\n[ "$1" = --version ] || {{ echo run >> "{runs}"; sleep 1; }}\nexec cc "$@"\n')
