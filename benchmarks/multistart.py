@@ -35,6 +35,7 @@ def searched(robot: str, name: str, guesses: int, indices: Sequence[int]) -> Ite
             "robot": robot,
             "task": name,
             "episode": i,
+            "guesses": guesses,
             "certified": certificate,
             "found": best if np.isfinite(best) else None,
             "solved": int(np.isfinite(tried).sum()),

@@ -296,21 +296,23 @@ def _in_pieces(name: str, pointers: Sequence[str], arguments: Sequence[str], lin
     Registers that a later piece reads are kept in memory between them.
     """
     pieces = [lines[first : first + _PIECE] for first in range(0, len(lines), _PIECE)]
-    needed: list[set[int]] = [set() for _ in pieces]  # after each piece
+    writes = [
+        {line.made: line for line in piece if line.made is not None} for piece in pieces
+    ]  # its last of a register
     begins: list[set[int]] = []  # what each piece reads before it writes it
     for piece in pieces:
-        written: set[int] = set()
-        begins.append(set())
+        begun, written = set(), set()
         for line in piece:
-            begins[-1].update(i for i in line.given if i not in written)
-            written.update(() if line.made is None else (line.made,))
+            begun.update(set(line.given) - written)
+            written.add(line.made)
+        begins.append(begun)
+    needed: list[set[int]] = [set() for _ in pieces]  # after each piece
     for i in reversed(range(len(pieces) - 1)):
-        needed[i] = begins[i + 1] | (needed[i + 1] - {line.made for line in pieces[i + 1]})
+        needed[i] = begins[i + 1] | (needed[i + 1] - set(writes[i + 1]))
     kept = "kept[{0} * LANES + k]"
     functions, constants = [], {}  # of registers that hold one at the end of a piece, its line
-    for i, piece in enumerate(pieces):
+    for i, (piece, last) in enumerate(zip(pieces, writes, strict=True)):
         before = [constants.get(r, _Line(f"w{r} = {kept.format(r)};", r, (), False)) for r in sorted(begins[i])]
-        last = {line.made: line for line in piece if line.made is not None}
         constants = {r: line for r, line in (constants | last).items() if line.constant}
         stored = sorted(needed[i] & set(last) - set(constants))
         after = [_Line(f"{kept.format(r)} = w{r};", None, (r,), False) for r in stored]
@@ -318,7 +320,7 @@ def _in_pieces(name: str, pointers: Sequence[str], arguments: Sequence[str], lin
         functions.append(_loop(f"{name}_{i}", [*arguments, "real *restrict kept"], whole, "__attribute__((noinline)) "))
     given = ", ".join(f"{pointer}, s{pointer}" for pointer in pointers)
     calls = "\n    ".join(f"{name}_{i}({given}, kept);" for i in range(len(pieces)))
-    size = 1 + max(line.made for line in lines if line.made is not None)
+    size = 1 + max(max(last, default=0) for last in writes)
     return "".join(functions) + (
         f"static void {name}({', '.join(arguments)}) {{\n    real kept[{size} * LANES];\n    {calls}\n}}\n"
     )

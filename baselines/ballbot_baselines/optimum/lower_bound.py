@@ -4,6 +4,7 @@ The theorem is at the top of `proofs/planar_bound.c`, and its numbers are in `lo
 """
 
 import json
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -69,7 +70,7 @@ class PlanarBound:
         least = float("nan") if plane is None else float(self.bound(plane[None], task.steps)[0])
         return least if least > 0 else float("nan")
 
-    def value(self, x: np.ndarray, degree: int = 8) -> np.ndarray:
+    def value(self, x: np.ndarray, degree: float = math.inf) -> np.ndarray:
         """(n,) V of planar states (n, 4), rounded, or its part up to a degree."""
         z = np.linalg.solve(np.array(self.t), x.T)[:, :, None]
         exponents = np.array(self.exponents).T

@@ -7,13 +7,13 @@ the schedule a_k and of the range of states. Then it checks the inequality of th
 
 import ctypes
 import itertools
+import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ballbot_gym.tasks.stabilize import Stabilize
 _PAIRS, _FOURS = (list(itertools.combinations_with_replacement(range(4), n)) for n in (2, 4))
 _KNOTS = 16
 _WIDEST = 1024.0
-_FLAGS = ("-O3", "-march=native")
+_FLAGS = ("-O3",)
 
 
 class _Problem(ctypes.Structure):
@@ -142,7 +142,7 @@ def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
     largest, rest = [max(corner[i] for corner in corners) for i in range(4)], Fraction(0)
     for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
         if sum(e) > 2:
-            rest += abs(Fraction(c)) * _product(largest[i] ** e[i] for i in range(4))
+            rest += abs(Fraction(c)) * math.prod(largest[i] ** e[i] for i in range(4))
     return Fraction(most), rest
 
 
@@ -166,13 +166,6 @@ def _is_positive(matrix: list[list[Fraction]]) -> bool:
         for i in range(p + 1, 4):
             m[i] = [x - m[i][p] / m[p][p] * y for x, y in zip(m[i], m[p], strict=True)]
     return True
-
-
-def _product(numbers: Any) -> Fraction:
-    out = Fraction(1)
-    for number in numbers:
-        out *= number
-    return out
 
 
 def _root(a: Fraction) -> Fraction:
