@@ -18,6 +18,7 @@ from ballbot_gym import certified, machine_code, ops
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.tasks.stabilize import Stabilize
 
 COUNT, ALONE = 12, 6  # drawn episodes, and how many of them are searched one by one too
@@ -123,6 +124,38 @@ def test_random_guesses_cost_no_more_and_depend_on_the_episode_alone(params):
     assert (more <= costs_of(search_many(task, params, x0, c, Backoff()))).all()
     alone = search_many(task, params, x0[1:2], c[1:2], Backoff(), slalom_guesses=8)
     assert costs_of(alone)[0] == more[1]
+
+
+def test_slaloms_pass_their_obstacles_on_the_sides_that_are_asked_for(params):
+    """Also from the middle of an episode, where the sides of obstacles that are behind do not count."""
+    known, task = certified.load("weave", "paper"), TASKS["weave"]()
+    x0, c = known.states[:8], known.constants[:8]
+    obstacles = [task.passed_obstacles(each) for each in c]
+    best = find_optima(task, params, x0, c)
+    sides = [sides_passed(optimum.trajectory.x, each) for optimum, each in zip(best, obstacles, strict=True)]
+    np.testing.assert_array_equal(costs_of(find_optima(task, params, x0, c, sides=sides)), costs_of(best))
+    others = [(-first, *rest) for first, *rest in sides]
+    found = find_optima(task, params, x0, c, sides=others)
+    solved = [i for i, optimum in enumerate(found) if optimum]
+    assert len(solved) > 4  # some sides are no slalom that a robot could drive
+    assert all(found[i].cost > best[i].cost for i in solved)
+    assert all(sides_passed(found[i].trajectory.x, obstacles[i]) == others[i] for i in solved)
+    middle = np.array([found[i].trajectory.x[60] for i in solved])
+    again = find_optima(task, params, middle, c[solved], sides=[sides[i] for i in solved])
+    for i, start, optimum in zip(solved, middle, again, strict=True):
+        behind = obstacles[i][:, 0] < start[0]
+        passed = np.array(sides_passed(optimum.trajectory.x, obstacles[i]))
+        assert ((passed == sides[i]) | behind).all()
+
+
+def test_sides_that_do_not_fit_are_refused(params):
+    known, task = certified.load("weave", "paper"), TASKS["weave"]()
+    x0, c = known.states[:1], known.constants[:1]
+    for sides, said in (([], "1 slaloms"), ([(1,)], "slalom 0"), ([(0,) * 5], "slalom 0")):
+        with pytest.raises(ValueError, match=said):
+            find_optima(task, params, x0, c, sides=sides)
+    with pytest.raises(ValueError, match="no obstacles"):
+        find_optima(Stabilize(), params, FALLEN[None], np.zeros((1, 0)), sides=[(1,)])
 
 
 @pytest.mark.slow

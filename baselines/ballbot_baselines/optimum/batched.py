@@ -20,7 +20,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,12 +72,18 @@ _HOPELESS = 64  # random guesses without a solution, after which an episode is l
 
 
 def search_many(
-    task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, slalom_guesses: int = 0
+    task: Task,
+    params: Robot,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    slalom_guesses: int = 0,
+    sides: Sequence[tuple[int, ...]] | None = None,
 ) -> list[Optimum | None] | None:
     """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
 
-    Slaloms are searched from up to `slalom_guesses` random guesses, too. The other tasks' searches miss nothing that random
-    guesses find; `benchmarks/multistart.py` counts it.
+    Slaloms are searched from up to `slalom_guesses` random guesses, too; the other tasks' searches miss nothing that these
+    find, which `benchmarks/multistart.py` counts. Or they pass obstacles on given `sides`, see `find_optima`.
 
     There is no list where episodes cannot be searched together: C code cannot be compiled here, it lacks an operation of the
     task, the task has a clock, or the robot has wheels.
@@ -88,7 +94,7 @@ def search_many(
     parts = [slice(first, first + _AT_ONCE) for first in range(0, len(x0), _AT_ONCE)]
     found: list[Optimum | None] = []
     for some in parts:
-        batch = _Batch(task, params, x0[some], c[some], backoff)
+        batch = _Batch(task, params, x0[some], c[some], backoff, sides and sides[some])
         batch.search(slalom_guesses if batch.is_slalom else 0, _ENOUGH)
         found += batch.optima()
     return found
@@ -127,7 +133,8 @@ class _Known(NamedTuple):
 class _Batch:
     """The search of some episodes."""
 
-    def __init__(self, task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff):
+    def __init__(self, task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, sides: Any = None):
+        self._wanted_sides: Sequence[tuple[int, ...]] | None = sides
         self._task, self._params, self._x0, self._c, self._backoff = task, params, x0, c, backoff
         self._solver = ilqr(task, params)
         self._seconds, self._costs = 0.0, np.full(len(x0), np.inf)
@@ -451,7 +458,10 @@ class _Batch:
                 steps = np.minimum(steps, np.ceil(after / shared).astype(int) * shared)
             for i, prices, last in zip(rows.tolist(), predicted, steps.tolist(), strict=True):
                 order = np.argsort(prices, kind="stable")
-                chosen = order[prices[order] <= prices.min() * (1 + found.doubt)]
+                if self._wanted_sides is not None:
+                    wanted, ahead = self._wanted_sides[i][:count], self._obstacles[i][:, 0] > self._x0[i, 0]
+                    order = order[((found.sides[order] == wanted) | ~ahead).all(1)]
+                chosen = order[prices[order] <= prices[order[0]] * (1 + found.doubt)]
                 likely.setdefault(last, {})[i] = found.sides[chosen]
         for steps, choices in likely.items():
             self._pass_obstacles(choices, steps)

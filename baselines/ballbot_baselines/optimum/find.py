@@ -9,6 +9,7 @@ there. What regrets are measured against is searched `twice`, by both.
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -27,6 +28,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.robot import Robot, checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.trajectory import Trajectory
 
 _NO_CHEAPER = 1e-6  # relative
@@ -150,6 +152,7 @@ def find_optima(
     c: np.ndarray,
     backoff: Backoff = Backoff(),
     guesses: int = CONSIDERED,
+    sides: Sequence[tuple[int, ...]] | None = None,
 ) -> list[Optimum | None]:
     """The optima of B episodes from states x0 with constants c, thousands at once on one core.
 
@@ -164,12 +167,14 @@ def find_optima(
         c: (B, nc) constants; (B, 0) where the task has none.
         backoff: distance kept from limits; none for the true optimum.
         guesses: how many of the task's guessed paths to solve at most where episodes are solved one after the other.
+        sides: of each slalom, 1 for every obstacle that is passed on its left, −1 on its right; default, the best. Obstacles
+            behind the initial state do not count.
 
     Returns:
-        The optimum of each episode; None where no search converged.
+        The optimum of each episode; None where no search converged, on these sides if they are given.
 
     Raises:
-        ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
+        ValueError: no task or robot of that name, or x0 or c has another shape or is not finite, or sides do not fit them.
     """
     task, params = make_task(task, params), checked_robot(params)
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
@@ -177,17 +182,58 @@ def find_optima(
         if array.ndim != 2 or array.shape != (len(x0), width):
             count = "B" if name == "x0" else len(x0)
             raise ValueError(f"{name} must have the shape ({count}, {width}), not {array.shape}")
-    together = batched.search_many(task, params, x0, c, backoff)
-    if together is not None:
-        return together
+    if sides is not None:
+        _check_sides(task, c, sides)
+    found = batched.search_many(task, params, x0, c, backoff, sides=sides)
+    if found is None:
+        found = _one_by_one(task, params, x0, c, backoff, guesses, sides)
+    if sides is not None:
+        found = [
+            optimum if optimum is not None and _passes(task, optimum, constants, chosen) else None
+            for optimum, constants, chosen in zip(found, c, sides, strict=True)
+        ]
+    return found
+
+
+def _one_by_one(
+    task: Task,
+    params: Robot,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    guesses: int,
+    sides: Sequence[tuple[int, ...]] | None,
+) -> list[Optimum | None]:
+    """`find_optima` where episodes cannot be solved together."""
     found: list[Optimum | None] = []
-    for state, constants in zip(x0, c, strict=True):
+    for i, (state, constants) in enumerate(zip(x0, c, strict=True)):
+        paths = None if sides is None else [task.routed_path(state, constants, sides[i])]
         try:
-            optimum = find_optimum(task, params, state, constants, backoff, guesses)
+            optimum = find_optimum(task, params, state, constants, backoff, guesses, paths)
             found.append(optimum if optimum.is_optimal else None)
         except PlanError:
             found.append(None)
     return found
+
+
+def _check_sides(task: Task, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> None:
+    if len(sides) != len(c):
+        raise ValueError(f"sides must be those of {len(c)} slaloms, not of {len(sides)}")
+    for i, (constants, chosen) in enumerate(zip(c, sides, strict=True)):
+        obstacles = task.passed_obstacles(constants)
+        if obstacles is None:
+            raise ValueError(f"{task.id} has no obstacles that could be passed on chosen sides; leave out sides")
+        if len(chosen) < len(obstacles) or not {*chosen} <= {-1, 1}:
+            raise ValueError(
+                f"sides of slalom {i} must be 1 or -1 for each of {len(obstacles)} obstacles, not {chosen}"
+            )
+
+
+def _passes(task: Task, optimum: Optimum, c: np.ndarray, sides: tuple[int, ...]) -> bool:
+    """Whether an optimum passes the obstacles ahead of its initial state on these sides."""
+    obstacles, path = np.asarray(task.passed_obstacles(c)), optimum.trajectory.x
+    ahead = obstacles[:, 0] > path[0, 0]
+    return all(np.array(sides_passed(path, obstacles))[ahead] == np.array(sides[: len(obstacles)])[ahead])
 
 
 def _cheaper(episode: Shooting, found: Optimum, cost: float) -> list[Solution]:
