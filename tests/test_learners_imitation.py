@@ -76,11 +76,17 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way(monkeypat
     assert np.percentile(off, 90) < 0.1  # where the learner acts: feedback about it is linear
 
 
-@pytest.mark.parametrize("name", ["turn", "weave"])
-def test_dagger_labels_what_it_meets(name, monkeypatch):
+@pytest.fixture
+def rough_routes(monkeypatch):
+    """Networks that decide on sides after a few steps, on sides that are often not the best."""
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
     monkeypatch.setattr(routing, "_DISTANCES", 1)
+
+
+@pytest.mark.parametrize("name", ["turn", "weave"])
+@pytest.mark.usefixtures("rough_routes")
+def test_dagger_labels_what_it_meets(name):
     task = TASKS[name]()
     settings = ("iterations", "episodes_per_iteration", "gradient_steps", "batch_size", "hidden")
     config = replace(LEARNERS["dagger"].settings(name), **{field: getattr(TINY_DAGGER, field) for field in settings})
@@ -157,6 +163,33 @@ def test_labels_are_what_the_optimum_from_there_would_do(name):
     assert len(off) > 80
     assert np.median(off) < 0.02
     assert np.percentile(off, 80) < 0.1  # feedback about an optimum is linear
+
+
+def test_labels_on_a_slalom_go_past_obstacles_on_the_sides_that_the_learner_chose(monkeypatch):
+    monkeypatch.setattr(dagger, "fit_routes", lambda *given: None)  # so that many sides are not the best
+    task, params = make_task("weave"), default_params()
+    small = ("iterations", "gathering_iterations", "gradient_steps", "batch_size", "hidden")
+    config = replace(dagger.TUNED["weave"], **{name: getattr(TINY_DAGGER, name) for name in small})
+    learner = dagger.Dagger(task, params, replace(config, episodes_per_iteration=8))
+    learner.iterate()
+    samples = learner.state_dict()["samples"]
+    rows = np.random.default_rng(0).integers(len(samples["actions"]), size=40)
+    seen, actions, states, constants = (
+        samples[name][rows] for name in ("observations", "actions", "states", "constants")
+    )
+    x, c = states.double().numpy(), constants.double().numpy()
+    sides = [tuple(chosen) for chosen in learner.network.routes(seen).int().tolist()]
+    found = find_optima(task, params, x, c, config.backoff, sides=sides)
+    off = [
+        np.abs(action - np.clip(optimum.trajectory.u[0] / params.force_limit, -1, 1)).max()
+        for action, optimum in zip(actions.numpy(), found, strict=True)
+        if optimum
+    ]
+    assert len(off) > 30
+    assert np.median(off) < 0.02
+    best = find_optima(task, params, x, c, config.backoff)
+    worse = [mine.cost > 1.001 * other.cost for mine, other in zip(found, best, strict=True) if mine and other]
+    assert np.mean(worse) > 0.1  # so the sides do matter here
 
 
 def test_batches_hold_new_states_near_optima_with_the_feedback_as_their_labels():

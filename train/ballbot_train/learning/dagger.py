@@ -8,16 +8,16 @@ structured prediction to no-regret online learning", 2011, with the mixture β o
 The feedback about an optimum is the derivative of the optimal force with respect to the state. It labels every state that an
 episode reaches near its optimum, and the states around it too: every batch draws new ones, whose labels differ by −K δ. This
 fits the slope of the policy together with its value, as in Czarnecki et al., "Sobolev training for neural networks" (2017).
-There are three exceptions, whose states label themselves alone, with errors divided by the cost of the episode's optimum, as
-in the regret. If a goal ends the episode, the derivative is steep before the goal, and policies that were fitted to it missed
-the goal more often. Next to an obstacle it is steep too, and policies that were fitted to it touched more obstacles. If
-observations depend on the past, on noise or on delayed forces, they are not known for other states.
+There are two exceptions, whose states label themselves alone, with errors divided by the cost of the episode's optimum, as in
+the regret. If a goal ends the episode, the derivative is steep before the goal, and policies that were fitted to it missed
+the goal more often. If observations depend on the past, on noise or on delayed forces, they are not known for other states.
+
+Where a learner decides first on which sides it passes obstacles, the optima are those that pass them on these sides.
 
 A share of the episodes begins where the learner fails or pays most, because failures are at the edge of what can be recovered
 from. On a track the expert has access to each episode's robot. The learner gets observations alone.
 """
 
-import contextlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,12 +28,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballbot_baselines import Backoff, Optimum, find_optima, find_optimum
+from ballbot_baselines import Backoff, Optimum, find_optima
 from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym.robot import Randomization, Robot, registered_name
-from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_train.evaluation import fresh
 from ballbot_train.learning import schedules
@@ -79,8 +77,13 @@ TUNED: dict[str, DaggerConfig] = {
     "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
     # plans at the force limit leave no force for corrections
     "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred", backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
-    "weave": DaggerConfig(
-        symmetry="routes", hidden=(256, 256), backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip)
+    "weave": replace(
+        _FEW,
+        gathering_iterations=5,
+        learning_rate=5e-3,
+        hidden=(128, 128),
+        symmetry="routes",
+        backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip),
     ),
 }
 """Exceptions by name of task; every other task takes the defaults."""
@@ -97,7 +100,6 @@ _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
 _HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
-_MOST_ALONE = 16  # of the optima that pass obstacles on other sides than the learner shall
 _ROBOTS = 16  # of an iteration on a track
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
@@ -198,7 +200,7 @@ class Dagger:
         torch.manual_seed(seed)
         varied = self._randomization
         present = not (history or varied.varies_actuator or varied.is_noisy)
-        self._around = present and not task.first_exit and task.routed_frame is None
+        self._around = present and not task.first_exit
         """Whether samples label the states around them too; see the top of this file."""
         # slopes are fitted best by smooth layers that are not bounded
         self.network = actor_for(task, params, config, history, False, start, "silu" if self._around else "tanh")
@@ -287,17 +289,11 @@ class Dagger:
         task, limits = self._task, np.array([[robot.force_limit] for robot in robots])
         c = state.c.T.double().numpy()
         x, sides = self._ahead(batch, state), self._sides(batch.observe(state))
-        optima = self._optima_of(robots, x, c)
-        if before is None:
-            others = np.flatnonzero(~self._passes(optima, c, sides))
-            for i in rng.permutation(others)[:_MOST_ALONE].tolist() if len(others) else ():
-                path = task.routed_path(x[i], c[i], sides[i])
-                with contextlib.suppress(PlanError):
-                    optima.put(i, find_optimum(task, robots[i], x[i], c[i], self.config.backoff, paths=[path]))
-        usable, costs = optima.solved & self._passes(optima, c, sides), optima.costs
+        optima = self._optima_of(robots, x, c, sides)
+        usable, costs = optima.solved, optima.costs
         if before is not None:
             costs = np.where(before[0].solved, before[0].costs, costs)
-            usable &= _goes_on(optima, *before)
+            usable = usable & _goes_on(optima, *before)
         steps = max(1, round(_SECONDS / task.control_dt))
         expert = rng.random((len(robots), 1)) < 0.5
         noise = (_NOISE_IN_GRIP if self._params.grips else _NOISE) * rng.random((len(robots), 1))
@@ -362,33 +358,28 @@ class Dagger:
         """Observations (n, no) of states (n, 8) of episodes with constants (n, nc)."""
         return torch.stack(tuple(self._task.seen(states.unbind(1), constants.unbind(1), self._params)), 1)
 
-    def _optima_of(self, robots: Sequence[Robot], x: np.ndarray, c: np.ndarray) -> _Optima:
-        """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours."""
+    def _optima_of(
+        self, robots: Sequence[Robot], x: np.ndarray, c: np.ndarray, sides: list[tuple[int, ...]] | None
+    ) -> _Optima:
+        """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours. They
+        pass obstacles on the learner's sides.
+        """
         found: list[Optimum | None] = []
         for robot, rows in itertools.groupby(range(len(robots)), robots.__getitem__):
             of = list(rows)
             few: dict[str, int] = {"guesses": 1} if robot.LONG_EQUATIONS else {}  # each takes seconds
-            found += find_optima(self._task, robot, x[of], c[of], self.config.backoff, **few)
+            own = sides and [sides[i] for i in of]
+            found += find_optima(self._task, robot, x[of], c[of], self.config.backoff, **few, sides=own)
         optima = _Optima.none(len(x), self._task.steps, x.shape[1], robots[0].action_size)
         for i, optimum in enumerate(found):
             optima.put(i, optimum)
         return optima
 
-    def _sides(self, observation: torch.Tensor) -> list[tuple[int, ...]]:
-        """On which sides the learner's routes pass the obstacles of B episodes; for each none, if it has no routes."""
+    def _sides(self, observation: torch.Tensor) -> list[tuple[int, ...]] | None:
+        """On which sides the learner's routes pass the obstacles of B episodes; None if it has no routes."""
         if self.network.routes is None:
-            return [()] * len(observation)
+            return None
         return [tuple(sides) for sides in self.network.routes(observation).int().tolist()]
-
-    def _passes(self, optima: _Optima, c: np.ndarray, sides: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """(B,) whether optima pass the obstacles ahead of their beginnings on these sides."""
-        passes = np.ones(len(c), bool)
-        for i, wanted in enumerate(sides):
-            if wanted:
-                obstacles, path = np.asarray(self._task.passed_obstacles(c[i])), optima.states[i]
-                mine, behind = sides_passed(path, obstacles), obstacles[:, 0] < path[0, 0]
-                passes[i] = ((np.array(mine) == wanted[: len(mine)]) | behind).all()
-        return passes
 
     def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
         """(B, 8) where the robots will be when a force of now arrives, after those that are on their way."""
