@@ -16,6 +16,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import dagger, routing, training
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import load_demos
+from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.network import PolicyNetwork
 
@@ -99,13 +100,14 @@ def test_dagger_labels_what_it_meets(name):
     assert state["actions"].abs().max() <= 1
 
 
+@pytest.mark.parametrize("squash", ["tanh", "clip"])
 @pytest.mark.parametrize(
     ("name", "symmetry"), [("stabilize", "odd"), ("orbit", "centred"), ("turn", "frame"), ("weave", "routes")]
 )
-def test_fits_act_as_the_policy_does(name, symmetry):
+def test_fits_act_as_the_policy_does(name, symmetry, squash):
     """What depends on observations alone is computed for many batches at once, and gives the same actions."""
     task, params, rng = make_task(name), default_params(), np.random.default_rng(0)
-    network = PolicyNetwork(spec_for(task, symmetry, (16,), True, activation="silu"))
+    network = PolicyNetwork(spec_for(task, symmetry, (16,), True, activation="silu", squash=squash))
     for part in network.mlp[-1].parameters():  # a new policy is its linear part
         torch.nn.init.normal_(part)
     x, c = map(np.array, zip(*(task.sample(rng, params) for _ in range(50)), strict=True))
@@ -113,6 +115,19 @@ def test_fits_act_as_the_policy_does(name, symmetry):
     actions = network(seen)
     assert actions.abs().max() > 0.1
     torch.testing.assert_close(network.acting(network.prepared(seen)), actions)
+
+
+def test_a_policy_that_acts_at_the_wrong_limit_learns_its_label():
+    """There a clip has no slope."""
+    torch.manual_seed(0)
+    network = PolicyNetwork(spec_for(make_task("stabilize"), "none", (16,), True, activation="silu", squash="clip"))
+    rng = np.random.default_rng(0)
+    seen, label = rng.standard_normal((64, 8)), np.tile([-0.5, 1.0], (64, 1))
+    torch.nn.init.constant_(network.mlp[-1].bias, 3.0)
+    observations = torch.as_tensor(seen, dtype=torch.float32)
+    assert (network(observations) == 1).all()
+    Fit(network, network.acting).run(Samples.of(seen, label), 500, 64, 1e-2, rng)
+    assert np.abs(network(observations).detach().numpy() - label).mean() < 0.05
 
 
 def feedback_errors(task, plan, c, backoff, gains, scale):

@@ -10,7 +10,7 @@ from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_gym.robot import PAPER, Robot, named_robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.policy.files import Activation, PolicySpec
+from ballbot_train.policy.files import Activation, PolicySpec, Squash
 from ballbot_train.policy.network import PolicyNetwork
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
@@ -34,8 +34,10 @@ def spec_for(
     robot: str = PAPER,
     informed: bool = False,
     activation: Activation = "tanh",
+    squash: Squash | None = None,
 ) -> PolicySpec:
-    """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
+    """The shape of a policy. With a linear part, which can start as LQR, its output is by default squashed smoothly, and
+    otherwise clipped.
 
     Layers of tanh are odd without biases. Others are averaged over opposite observations instead.
     Three wheels do not have the task's symmetry, so a robot with wheels does without.
@@ -75,7 +77,7 @@ def spec_for(
         routes=_ROUTES if symmetry == "routes" else (),
         centred=symmetry == "centred",
         mirrors=tuple((task.observation_signs(mirror), mirror.action) for mirror in mirrors),
-        squash="tanh" if linear else "clip",
+        squash=squash or ("tanh" if linear else "clip"),
         history=history,
         informed=informed,
     )
@@ -89,9 +91,11 @@ def actor_for(
     informed: bool,
     start: PolicyNetwork | None,
     activation: Activation = "tanh",
+    squash: Squash = "tanh",
 ) -> PolicyNetwork:
     """A policy to train, of the config's symmetry and hidden layers, that starts as LQR; or `start` as `started` makes it."""
-    spec = spec_for(task, config.symmetry, config.hidden, True, history, registered_name(params), informed, activation)
+    robot = registered_name(params)
+    spec = spec_for(task, config.symmetry, config.hidden, True, history, robot, informed, activation, squash)
     if start is not None:
         return started(start, spec)
     made = PolicyNetwork(spec)

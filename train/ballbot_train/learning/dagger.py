@@ -202,8 +202,9 @@ class Dagger:
         present = not (history or varied.varies_actuator or varied.is_noisy)
         self._around = present and not task.first_exit
         """Whether samples label the states around them too; see the top of this file."""
-        # slopes are fitted best by smooth layers that are not bounded
-        self.network = actor_for(task, params, config, history, False, start, "silu" if self._around else "tanh")
+        # slopes are fitted best by smooth layers, and at the limits of the action by a clip
+        shape = ("silu", "clip") if self._around else ("tanh", "tanh")
+        self.network = actor_for(task, params, config, history, False, start, *shape)
         self._fit = Fit(self.network, self.network.acting)
         empty = np.zeros((0, self.network.spec.seen)), np.zeros((0, params.action_size)), np.zeros(0)
         self._samples = self._samples_of(*(shown or empty))

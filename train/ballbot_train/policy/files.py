@@ -44,6 +44,10 @@ _HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's sp
 Activation = Literal["tanh", "relu", "silu"]
 """What follows each hidden layer of a policy."""
 
+Squash = Literal["tanh", "clip", "tanh_in_frame"]
+"""How the sum of a policy's parts is brought into [−1, 1]. "tanh_in_frame" is that of `sac`: tanh, times `REACH`, in the
+frame, then clip."""
+
 Mirrors = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 """Signs of the observation and of the action in each mirror image."""
 
@@ -81,8 +85,8 @@ class PolicySpec:
     """Whether the action in the frame's steady motion is exactly the one that keeps it."""
     mirrors: Mirrors = ()
     """Mirror images over which the network's output is averaged."""
-    squash: Literal["tanh", "clip", "tanh_in_frame"] = "tanh"
-    """How the sum is brought into [−1, 1]. "tanh_in_frame" is that of `sac`: tanh, times `REACH`, in the frame, then clip."""
+    squash: Squash = "tanh"
+    """See `Squash`."""
     observation_version: int = OBSERVATION_VERSION
     robot: str = PAPER
     """Name in `ROBOTS` of the robot it was trained on."""

@@ -112,9 +112,19 @@ class PolicyNetwork(torch.nn.Module):
         return _stacked((*features, *axes, *steady), observation)
 
     def acting(self, prepared: torch.Tensor) -> torch.Tensor:
-        """Actions (B, 2) for what `prepared` gives of observations: those of `forward`, to rounding."""
+        """Actions (B, 2) for what `prepared` gives of observations: those of `forward`, to rounding.
+
+        Gradients pass a clip as if it were not there, so that a policy can be fitted where it acts at the wrong limit. Where
+        the limit is right, the error is zero, and nothing has to be learned beyond it.
+        """
+        raw = self._unsquashed(prepared)
+        acted = self._squashed(raw)
+        return acted if self.spec.squash == "tanh" else raw + (acted - raw).detach()
+
+    def _unsquashed(self, prepared: torch.Tensor) -> torch.Tensor:
+        """`raw` for what `prepared` gives of observations."""
         if self._frame is None:
-            return self(prepared)
+            return self.raw(prepared)
         if self.spec.centred:
             size = (prepared.shape[-1] - 6) // 2
             inputs, axes, kept, needed = prepared.split_with_sizes([size, 4, size, 2], -1)
@@ -124,7 +134,7 @@ class PolicyNetwork(torch.nn.Module):
             inputs, axes = prepared.split_with_sizes([prepared.shape[-1] - 4, 4], -1)
             action = self._sum(inputs)
         action = self._reached(action)
-        return self._squashed(action[:, :1] * axes[:, :2] + action[:, 1:] * axes[:, 2:])
+        return action[:, :1] * axes[:, :2] + action[:, 1:] * axes[:, 2:]
 
     def knowing(self, observation: torch.Tensor, state: "BatchState", track: Randomization) -> torch.Tensor:
         """Actions (B, 2) for observations (B, no) without the robots' parameters, which an informed policy needs.
