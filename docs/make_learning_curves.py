@@ -135,7 +135,7 @@ def picture() -> Figure:
             panels[task].plot(seconds / 60, 100 * regrets, ".-", ms=3, lw=1.2, color=color(learner), label=name)
     for task, axis in panels.items():
         axis.set(title=task.capitalize(), xlabel="minutes of one core", xscale="log", yscale="log")
-        axis.set(xlim=(0.3, 60), xticks=[1, 3, 10, 30], ylim=(0.25, 50), yticks=[0.5, 1, 2, 5, 10, 20])
+        axis.set(xlim=(0.3, 60), xticks=[1, 3, 10, 30], ylim=(0.12, 50), yticks=[0.2, 0.5, 1, 2, 5, 10, 20])
         axis.minorticks_off()
         axis.xaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_major_formatter("{x:g} %")

@@ -7,6 +7,8 @@ import re
 import shlex
 import shutil
 import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -241,6 +243,21 @@ def test_recorded_commands_give_the_recorded_settings(path):
             }
         else:
             parsed(command)
+
+
+@pytest.mark.slow
+def test_a_recorded_command_makes_its_policy_again_from_nothing(tmp_path):
+    """Rounding differs between kinds of processors, so its weights may differ, and what it measures hardly."""
+    command = shlex.split(RECORDED["stabilize-dagger"])
+    command[command.index("--out") + 1] = str(tmp_path)
+    subprocess.run([sys.executable, "-m", "ballbot_train.cli", *command[1:]], check=True)
+    again, shipped = (
+        json.loads((folder / name).read_text())
+        for folder, name in ((tmp_path, "policy.json"), (SHIPPED, "stabilize-dagger.json"))
+    )
+    assert again["spec"] == shipped["spec"]
+    assert again["measured"]["success"] == 1.0
+    assert abs(again["measured"]["regret_mean"] - shipped["measured"]["regret_mean"]) < 0.002
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
