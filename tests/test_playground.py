@@ -25,6 +25,7 @@ from ballbot_train.policy.files import BEST, SHIPPED, PolicyError, PolicySpec, s
 from ballbot_train.policy.network import PolicyNetwork
 from ballbot_train.policy.printed import JAVASCRIPT
 from ballbot_train.report import playground
+from ballbot_train.report.labels import label
 from ballbot_train.report.playground import SCENARIOS, engine_script, playground_page
 
 CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
@@ -260,7 +261,7 @@ def test_in_the_browser_lqr_falls_from_the_first_push_and_the_policy_leans_and_c
     assert policy != lqr
     _, ended, cells = advance(opened, 200)
     assert ended == ["", "tilt"]
-    assert cells[0][0] == "SHAC policy"
+    assert cells[0][0] == f"{label(BEST['stabilize'])} policy"
     assert 40 < float(cells[0][2].rstrip("°")) < 50  # its largest tilt
     assert float(cells[0][1].rstrip("°")) < 5
     assert cells[1][5] == "fell"
@@ -288,7 +289,7 @@ def test_in_the_browser_a_robot_that_nobody_told_has_no_regret(opened):
     factors = np.array(opened.execute_script("return playground.robot"))
     assert ((bounds[:, 0] <= factors) & (factors <= bounds[:, 1])).all()
     cells = advance(opened, 50)[2]
-    assert [row[0] for row in cells] == ["SHAC policy", "LQR"]
+    assert [row[0] for row in cells] == [f"{label(BEST['stabilize'])} policy", "LQR"]
     assert "%" not in cells[0][5]
     opened.execute_script("document.querySelector('.known').disabled || document.querySelector('.known').click()")
     assert advance(opened, 50)[2][2][0] == "optimum"

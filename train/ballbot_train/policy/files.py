@@ -27,7 +27,7 @@ OBSERVATION_VERSION = 1
 SHIPPED = Path(__file__).parent.parent / "policies"
 """Policies that come with the package, as TASK-LEARNER.json and .safetensors, or TASK-ROBOT-LEARNER for other robots."""
 
-BEST = {"stabilize": "shac", "turn": "shac", "orbit": "ppo", "weave": "shac"}
+BEST = {"stabilize": "dagger", "turn": "shac", "orbit": "dagger", "weave": "shac"}
 """The learner of each task's shipped policy with the least mean regret, for the paper's robot."""
 
 _MOST_LAYERS = 64
