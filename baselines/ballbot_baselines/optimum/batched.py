@@ -20,7 +20,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,6 +69,7 @@ _FEW = 16  # problems
 _AT_ONCE = 256  # episodes in memory
 _ENOUGH = 16  # solutions from random guesses
 _HOPELESS = 64  # random guesses without a solution, after which an episode is left
+_Sides = Sequence[tuple[int, ...]]  # of each slalom, see `find_optima`
 
 
 def search_many(
@@ -78,12 +79,12 @@ def search_many(
     c: np.ndarray,
     backoff: Backoff,
     slalom_guesses: int = 0,
-    sides: Sequence[tuple[int, ...]] | None = None,
+    sides: _Sides | None = None,
 ) -> list[Optimum | None] | None:
     """The optima of B episodes from states x0 (B, 8) with constants c (B, nc), found on one core; None where none was found.
 
-    Slaloms are searched from up to `slalom_guesses` random guesses, too; the other tasks' searches miss nothing that these
-    find, which `benchmarks/multistart.py` counts. Or they pass obstacles on given `sides`, see `find_optima`.
+    Slaloms are searched from up to `slalom_guesses` random guesses, too, or on given `sides`, see `find_optima`. The other
+    tasks' searches miss nothing that random guesses find; `benchmarks/multistart.py` counts it.
 
     There is no list where episodes cannot be searched together: C code cannot be compiled here, it lacks an operation of the
     task, the task has a clock, or the robot has wheels.
@@ -133,8 +134,10 @@ class _Known(NamedTuple):
 class _Batch:
     """The search of some episodes."""
 
-    def __init__(self, task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, sides: Any = None):
-        self._wanted_sides: Sequence[tuple[int, ...]] | None = sides
+    def __init__(
+        self, task: Task, params: Robot, x0: np.ndarray, c: np.ndarray, backoff: Backoff, sides: _Sides | None = None
+    ):
+        self._wanted_sides = sides
         self._task, self._params, self._x0, self._c, self._backoff = task, params, x0, c, backoff
         self._solver = ilqr(task, params)
         self._seconds, self._costs = 0.0, np.full(len(x0), np.inf)
