@@ -9,8 +9,7 @@ starts the bound covers, and what share of the optimal cost it is in random stat
 """
 
 import itertools
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -197,7 +196,7 @@ def main(
     left = fit.left(rho)
     print(f"the inequality leaves {left.min():.4f} to {left.max():.4f} of the cost rate in {len(left)} samples")
     print(f"delta {certificate.delta}, a {certificate.schedule(TASK.steps):.4f} of V")
-    files.write(out, json.dumps(asdict(certificate)) + "\n")
+    files.write(out, certificate.text())
     if states:
         measure(certificate, states)
 

@@ -2,7 +2,9 @@
 
 import ctypes
 import itertools
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,6 +92,27 @@ def test_a_bound_that_claims_too_much_is_refused(certificate: PlanarBound, facto
         certificate, coefficients=[factor * c for c in certificate.coefficients], delta=factor * certificate.delta
     )
     assert not all(proven for _, _, proven in check_parts(wrong, roots=slice(-32, None), workers=1))
+
+
+def test_the_command_and_its_users_refuse_a_coefficient_that_was_changed_in_its_fifth_digit(
+    certificate: PlanarBound, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    prove = pytest.importorskip("ballbot_train.commands.prove").prove
+    changed, path = json.loads(certificate.text()), tmp_path / "lower_bound.json"
+    monkeypatch.setattr("ballbot_baselines.optimum.lower_bound._STORED", path)
+    path.write_text(json.dumps(changed))
+    PlanarBound.stored.cache_clear()
+    assert PlanarBound.stored() == certificate
+    changed["coefficients"][7] *= 1 + 1e-5
+    path.write_text(json.dumps(changed))
+    PlanarBound.stored.cache_clear()
+    try:
+        with pytest.raises(ValueError, match="was changed: the SHA-256 of its numbers"):
+            prove(planar=True)
+        with pytest.raises(ValueError, match="was changed"):
+            PlanarBound.stored()
+    finally:
+        PlanarBound.stored.cache_clear()
 
 
 def test_numbers_that_the_theorem_does_not_allow_are_refused(certificate: PlanarBound) -> None:

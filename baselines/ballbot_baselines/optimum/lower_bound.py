@@ -3,17 +3,20 @@
 The theorem is at the top of `proofs/planar_bound.c`, and its numbers are in `lower_bound.json`.
 """
 
+import hashlib
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ballbot_gym.robot import PAPER, Robot, named_robot
 from ballbot_gym.tasks import Stabilize, Task
 
+_STORED = Path(__file__).with_name("lower_bound.json")
 _FREE = ("duration", "survival_reward", "start_position", "start_lean", "start_speed", "start_lean_rate")
 """Fields of Stabilize that may have any value: of steps there may be any number, and no cost depends on the other ones."""
 
@@ -47,8 +50,24 @@ class PlanarBound:
     @classmethod
     @cache
     def stored(cls) -> "PlanarBound":
-        """The proven bound that comes with the package."""
-        return cls(**json.loads(Path(__file__).with_name("lower_bound.json").read_text(encoding="utf-8")))
+        """The proven bound that comes with the package.
+
+        Raises:
+            ValueError: the file is not as it was written.
+        """
+        numbers = json.loads(_STORED.read_text(encoding="utf-8"))
+        said, found = numbers.pop("sha256", None), _digest(numbers)
+        if said != found:
+            raise ValueError(
+                f"{_STORED} was changed: the SHA-256 of its numbers is {found}, and the file says {said}. Install the "
+                "package again; or, to check other numbers, write the file with `benchmarks/planar_bound.py`"
+            )
+        return cls(**numbers)
+
+    def text(self) -> str:
+        """The content of `lower_bound.json`: all numbers, and their SHA-256."""
+        numbers = asdict(self)
+        return json.dumps(numbers | {"sha256": _digest(numbers)}) + "\n"
 
     def of_episode(self, task: Task, robot: Robot, x0: np.ndarray) -> float:
         """The least cost of a successful motion in the vertical plane of its start.
@@ -102,3 +121,8 @@ class PlanarBound:
 
     def _dt(self) -> float:
         return Stabilize().control_dt
+
+
+def _digest(numbers: dict[str, Any]) -> str:
+    """SHA-256 of the numbers of a bound."""
+    return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
