@@ -504,6 +504,19 @@ def test_the_regret_of_the_controller_is_that_of_parts_of_a_log_that_end_at_rest
     assert _scores(found, driven.readings) == []
 
 
+def test_the_regret_of_a_drive_does_not_depend_on_the_heading_that_the_robot_keeps() -> None:
+    def motion(t: float) -> np.ndarray:
+        return np.array([0.4 * (t >= 3.0), 0.0, 0.4])
+
+    omni: Any = named_robot("omni")
+    made = record(omni, 9.0, motion, None, "rk4")
+    assert made.trajectory.x[-1, 8] == pytest.approx(0.4, abs=0.01)
+    problem = Problem(omni, made.readings.names, KNOWN)
+    z = np.zeros(len(problem.parameters))
+    (score,) = _scores(Found(problem, z, np.eye(len(z)), 0), made.readings)
+    assert abs(score.regret) < 0.1  # with the price of the heading it is over 3
+
+
 def test_a_controller_of_ones_own_drives_the_robot_that_the_seed_draws_from_where_it_is_put() -> None:
     varied, start = Randomization(body_mass=(0.8, 1.2), position_noise=0.005), np.zeros(8)
     start[0] = 0.5
