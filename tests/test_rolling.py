@@ -33,6 +33,7 @@ from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.evaluation.controllers import controllers_of
+from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import PolicyError, PolicySpec, shipped_policies
 from ballbot_train.policy.network import PolicyNetwork, load_policy
 
@@ -385,3 +386,12 @@ def test_weights_to_start_from_may_be_of_another_robot_and_its_episodes():
     assert PolicyNetwork.load(path, there, robot=None).spec.robot == "paper"
     with pytest.raises(PolicyError, match="was trained on Orbit, not on Turn"):
         PolicyNetwork.load(path, make_task("turn"), robot=None)
+
+
+def test_a_policy_that_was_trained_on_from_that_of_another_robot_is_one_of_its_own_robot(rolling, tmp_path):
+    orbit = make_task("orbit", "rolling")
+    start = PolicyNetwork.load(shipped_policies(make_task("orbit"))["dagger"], orbit, robot=None)
+    settings = dataclasses.replace(LEARNERS["apg"].settings("orbit", warm=True), num_envs=2, iterations=1)
+    learner = LEARNERS["apg"].make(orbit, rolling, settings, 0, start=start)
+    path = learner.network.save(tmp_path / "mine", {})
+    assert PolicyNetwork.load(path, orbit, "rolling").spec.robot == "rolling"

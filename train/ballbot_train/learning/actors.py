@@ -127,7 +127,8 @@ def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
         ValueError: it sees a longer past than `mine`, or is informed and `mine` is not, or commands another number of motors.
     """
     start, informed = network.spec, network.spec.informed or mine.informed
-    spec = replace(start, task=mine.task, robot=mine.robot, history=mine.history, informed=informed)
+    own = {name: getattr(mine, name) for name in ("task", "robot", "history", "robot_numbers", "observation_digest")}
+    spec = replace(start, **own, informed=informed)
     if start.history > mine.history:
         raise ValueError(
             f"the policy to start from observes {start.history} earlier steps; give --history {start.history}"
