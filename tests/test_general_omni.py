@@ -178,3 +178,22 @@ def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_
     for k in range(400):
         seen, *_, info = env.step(controller.act(0.02 * k, seen) / known.force_limit)
     np.testing.assert_allclose(info["state"][:2], 0.0, atol=0.05)
+
+
+def test_forces_that_a_log_took_for_drifts_do_not_hide_the_lean():
+    task, robot, known = (
+        make_task("stabilize", "omni"),
+        replace(SAME, axle_friction=0.3),
+        replace(SAME, axle_friction=0.1),
+    )
+    env = BallbotEnv(task, "rk4", robot=robot, observation="sensors")
+    seen, info = env.reset(seed=1, options={"state": np.array([0.3, -0.2, 0.05, 0.04, *[0.0] * 7])})
+    drifts = {"accel_x bias": 0.0, "accel_y bias": 0.0, "speed drift": 0.2, "lean rate drift": 0.35}
+    controller, errors = FilteredController(task, known, "-ekf", LqrController(task, known), drifts), []
+    controller.reset(0.0, seen, np.zeros(0))
+    for k in range(200):
+        u = controller.act(0.02 * k, seen)
+        errors.append(controller.filter.x[2:4] - info["state"][2:4])
+        seen, *_, info = env.step(u / known.force_limit)
+    assert np.sqrt(np.mean(np.square(errors[25:]))) < 0.001  # rad; 0.005 if speeds drift and forces do not
+    np.testing.assert_allclose(info["state"][:2], 0.0, atol=0.03)

@@ -183,7 +183,7 @@ def _corrected(
     return z + np.einsum("...ij,...j->...i", gain, missed), p, spread
 
 
-_SHARE = 0.1  # of the force limit: what the force of a wheel may differ by
+_SHARE = 0.1  # of the force limit: what the force of a wheel may differ by, if no log says it
 _LASTS = 0.5  # s after which little of this difference is left
 _ACCELEROMETER_BIAS = 0.2  # m/s², standard deviation of its bias
 _LEFT = 0.03  # m/s², the same of what is left of a bias that was identified
@@ -298,12 +298,19 @@ class _DisturbanceFilter(SensorFilter):
     that of the model. Controllers subtract this `disturbance` (3,), N, from their forces. It fades: a difference that lasted
     would explain every lean, and so hide a bias. The biases are those of the accelerometer across the body's axis. They
     include errors of where the centre of mass is, because the motion alone shows how far a centre of mass leans.
+
+    `ballbot identify` estimates no such forces, so what they do to speeds and lean rates is in the drifts that it finds. Here
+    these drifts say how large the forces are, and there is no other drift: the accelerometer feels a force, but it would not
+    feel a drift, and the filter would not believe it.
     """
 
     def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
-        super().__init__(task, params, errors)
+        errors = errors or {}
+        super().__init__(task, params, {name: each for name, each in errors.items() if not name.endswith(" drift")})
         self._force = (_SHARE * params.force_limit) ** 2
-        identified = {"accel_x bias", "accel_y bias"} <= set(errors or {})
+        if {"speed drift", "lean rate drift"} <= set(errors):
+            self._force = self._drifting(errors["speed drift"], errors["lean rate drift"])
+        identified = {"accel_x bias", "accel_y bias"} <= set(errors)
         self._of_bias = (_LEFT if identified else _ACCELEROMETER_BIAS) ** 2
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
@@ -325,6 +332,13 @@ class _DisturbanceFilter(SensorFilter):
         self._p = moves @ self._p @ moves.T
         self._p += np.diag([*self.model_variance, 0.0, 0.0, *[(1 - lasts**2) * self._force] * 3])
         self.disturbance = self._z[16:].copy()
+
+    def _drifting(self, speed: float, lean_rate: float) -> float:
+        """Variance of the force of each wheel, N², that makes speeds and lean rates drift at rest, by at least this much."""
+        x = np.zeros(11)
+        still, *moved = (np.array(self.model(x, u)[0])[4:8, 0] for u in (np.zeros(3), *np.eye(3)))
+        per_force = np.sum((np.array(moved) - still) ** 2, axis=0)  # of three independent forces of 1 N
+        return float(np.max(np.square([speed, speed, lean_rate, lean_rate]) / per_force) / (2 * _LASTS))
 
     def _with_slopes(self, function: casadi.Function, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The value (n, 1) of a function at the estimate, and its slopes (n, 14) in the state and in the wheels' forces."""
