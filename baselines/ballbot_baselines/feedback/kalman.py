@@ -184,6 +184,7 @@ def _corrected(
 
 
 _SHARE = 0.1  # of the force limit: what the force of a wheel may differ by, if no log says it
+_FAST = 100.0  # m/s, at which dry friction has its full size
 _LASTS = 0.5  # s after which little of this difference is left
 _ACCELEROMETER_BIAS = 0.2  # m/s², standard deviation of its bias
 _LEFT = 0.03  # m/s², the same of what is left of a bias that was identified
@@ -300,8 +301,8 @@ class _DisturbanceFilter(SensorFilter):
     include errors of where the centre of mass is, because the motion alone shows how far a centre of mass leans.
 
     `ballbot identify` estimates no such forces, so what they do to speeds and lean rates is in the drifts that it finds. Here
-    these drifts say how large the forces are, and there is no other drift: the accelerometer feels a force, but it would not
-    feel a drift, and the filter would not believe it.
+    these drifts and the dry friction say how large the forces are, and there is no other drift: the accelerometer feels a
+    force, but it would not feel a drift, and the filter would not believe it.
     """
 
     def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
@@ -309,7 +310,9 @@ class _DisturbanceFilter(SensorFilter):
         super().__init__(task, params, {name: each for name, each in errors.items() if not name.endswith(" drift")})
         self._force = (_SHARE * params.force_limit) ** 2
         if {"speed drift", "lean rate drift"} <= set(errors):
-            self._force = self._drifting(errors["speed drift"], errors["lean rate drift"])
+            robot: Any = params
+            friction = _FAST * robot.axle_drag(_FAST)  # no model says in which direction it holds a wheel at rest
+            self._force = self._drifting(errors["speed drift"], errors["lean rate drift"]) + friction**2
         identified = {"accel_x bias", "accel_y bias"} <= set(errors)
         self._of_bias = (_LEFT if identified else _ACCELEROMETER_BIAS) ** 2
 
