@@ -577,7 +577,7 @@ TYPED = [
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),
     ("train apg --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
-    ("evaluate dagger --fresh 10", "unknown controller dagger"),  # Stabilize has none
+    ("evaluate apg --fresh 10", "unknown controller apg"),  # no policy has this name
     ("replay stabilize turn", "give one task"),
     ("export lqr", "lqr is an expert"),
     ("export shac-ekf --task orbit --robot omni_strong --format c", "leave out -ekf"),

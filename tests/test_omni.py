@@ -279,8 +279,8 @@ def test_learners_command_three_motors(robot, learner, settings, monkeypatch):
     assert episode.success  # it starts as LQR
     before = {name: part.clone() for name, part in made.network.state_dict().items()}
     made.iterate()
-    activation = "silu" if learner == "dagger" else "tanh"
-    assert made.network.spec == PolicySpec.of(task, "omni", hidden=(8,), activation=activation)
+    shape = {"activation": "silu", "squash": "clip"} if learner == "dagger" else {}
+    assert made.network.spec == PolicySpec.of(task, "omni", hidden=(8,), **shape)
     assert all(part.isfinite().all() for part in made.network.state_dict().values())
     assert any((part != before[name]).any() for name, part in made.network.state_dict().items())
     with pytest.raises(ValueError, match="cannot start"):

@@ -11,6 +11,7 @@ import pytest
 from browser import start_chromium
 
 from ballbot_gym.drawing.viewer import Viewer
+from ballbot_train.policy.files import BEST
 from ballbot_train.report.live_page import PlayPage
 from ballbot_train.report.playground import playground_page
 from ballbot_train.report.simulation import Playground
@@ -74,7 +75,7 @@ def test_controls_change_the_playground(opened, visitor):
     visitor.ask("Episode", "random")
     wait_for(lambda: playground.episode == "random")
     visitor.ask("Task", "orbit")
-    wait_for(lambda: visitor.value("Task") == "orbit" and visitor.value("Controller") == "ppo")
+    wait_for(lambda: visitor.value("Task") == "orbit" and visitor.value("Controller") == BEST["orbit"])
     visitor.ask("lqr")
     wait_for(lambda: playground.ghosts == ("lqr",))
     visitor.ask("Restart")
