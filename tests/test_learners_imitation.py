@@ -77,17 +77,11 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way(monkeypat
     assert np.percentile(off, 90) < 0.1  # where the learner acts: feedback about it is linear
 
 
-@pytest.fixture
-def rough_routes(monkeypatch):
-    """Networks that decide on sides after a few steps, on sides that are often not the best."""
+@pytest.mark.parametrize("name", ["turn", "weave"])
+def test_dagger_labels_what_it_meets(name, monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
     monkeypatch.setattr(routing, "_DISTANCES", 1)
-
-
-@pytest.mark.parametrize("name", ["turn", "weave"])
-@pytest.mark.usefixtures("rough_routes")
-def test_dagger_labels_what_it_meets(name):
     task = TASKS[name]()
     settings = ("iterations", "episodes_per_iteration", "gradient_steps", "batch_size", "hidden")
     config = replace(LEARNERS["dagger"].settings(name), **{field: getattr(TINY_DAGGER, field) for field in settings})

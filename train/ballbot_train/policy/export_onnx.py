@@ -94,9 +94,8 @@ def _check(model: Any, network: PolicyNetwork) -> None:
 
     check_model(model, full_check=True)
     observations = np.random.default_rng(0).normal(size=(64, network.spec.seen)).astype(np.float32)
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # its sigmoid computes both of two formulas, and takes the finite one
+    # the reference's sigmoid computes both of two formulas, and takes the finite one
+    with np.errstate(over="ignore", invalid="ignore"):
         (found,) = ReferenceEvaluator(model).run(None, {"observation": observations})  # pyright: ignore
     with torch.inference_mode():
         expected = network(torch.as_tensor(observations)).numpy()
