@@ -2,9 +2,11 @@
 
 import contextlib
 import math
+import runpy
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,6 +117,32 @@ def test_a_second_search_finds_what_the_first_one_misses(name, episode, params):
     assert once.cost > 1.01 * twice.cost
     assert twice.is_optimal
     assert twice.cost == pytest.approx(known.costs[episode], rel=1e-6)
+
+
+def test_a_motion_that_costs_less_than_what_the_other_solver_comes_to_from_there_is_returned_itself(params):
+    task, x0 = Stabilize(), certified.load("stabilize", "paper").states[3]
+    (found,) = find_optima(task, params, x0[None], NO_CONSTANTS[None])
+    second = replace(found, cost=found.cost * (1 - 1e-5))
+    optimum = find_optimum(task, params, x0, NO_CONSTANTS, start=1.0, twice=second)
+    assert (optimum.cost, optimum.solver) == (second.cost, "ilqr")
+    np.testing.assert_array_equal(optimum.trajectory.u, found.trajectory.u)
+    assert optimum.trajectory.t[0] == 1.0
+
+
+def test_the_search_from_random_guesses_fails_where_a_stored_optimum_differs_in_its_fifth_digit(tmp_path, params):
+    search = runpy.run_path(str(Path(__file__).parent.parent / "benchmarks" / "multistart.py"))["main"]
+    options = {"tasks": ("turn",), "robots": ("paper",), "guesses": 4, "episodes": 2}
+    search(**options, out=tmp_path / "stored")
+    known, task = certified.load("turn", "paper"), TASKS["turn"]()
+    for name, factor in (("higher", 1 + 1e-4), ("lower", 1 - 1e-4)):
+        changed = replace(known, costs=np.concatenate([known.costs[:2] * factor, known.costs[2:]]))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(certified, "load", lambda *_, changed=changed: changed)
+            with pytest.raises(SystemExit, match="1"):
+                search(**options, out=tmp_path / name)
+    assert [path.parent.name for path in tmp_path.rglob("*.npz")] == ["higher"]
+    improved = certified.load(task, params, tmp_path / "higher" / certified.path_of(task).name)
+    np.testing.assert_allclose(improved.costs, known.costs, rtol=1e-6)
 
 
 def test_random_guesses_cost_no_more_and_depend_on_the_episode_alone(params):
