@@ -38,6 +38,13 @@ def test_searches_begin_at_the_hardest_episodes_and_end_at_harder_ones(fresh, fo
     assert ended.regrets[0] > hardest[0]
 
 
+def test_gradient_ascent_goes_on_from_the_hardest_ends(fresh, found, monkeypatch):
+    monkeypatch.setattr(adversarial, "_CLIMBS", 0)
+    _, random = hard_starts("shac", fresh, **FEW)
+    assert (found[1].hardness >= random.hardness).all()
+    assert found[1].hardness[0] > 1.01 * random.hardness[0]
+
+
 def test_starts_are_in_the_set_from_which_episodes_are_drawn(found):
     x = np.abs(found[1].states)
     assert (x[:, :2] <= 2).all()

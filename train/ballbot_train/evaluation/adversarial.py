@@ -3,7 +3,8 @@
 A policy that fails in none of 10,000 fresh episodes may still fail from some start. An episode is a function of uniform
 random numbers, so each episode is a point of a cube. A search begins at a hard episode. It moves its point by random steps,
 and keeps the moves that make the episode harder: by more regret, by a missed goal, and at last by a failure. The steps
-become smaller from round to round.
+become smaller from round to round. From the hardest ends, gradient ascent goes on: its slopes are differences, because a
+policy's cost and the optimum both depend on the start.
 """
 
 import zlib
@@ -31,6 +32,9 @@ _CONSIDERED = 10  # times as many episodes as searches; searches begin at the ha
 _LARGEST, _SMALLEST = 0.1, 0.003  # standard deviations of the steps in the unit cube, in the first and the last round
 _TOGETHER = 100  # searches of a task of a worker
 _CHECKED = 2  # of these, how many end with an optimum that was searched for as those of certified episodes are
+_CLIMBING = 20  # of the ends of all searches, from how many gradient ascent goes on
+_CLIMBS, _FIRST_CLIMB = 6, 0.01  # steps of gradient ascent, and the length of the first one in the unit cube
+_DIFFERENCE = 1e-4  # in the unit cube, for slopes
 _MISSED, _FAILED = 1e6, 2e6  # how hard an episode without success is, and one that fails; no regret is as large
 
 
@@ -115,6 +119,10 @@ def hard_starts(
     parts = [began.at(chunk) for chunk in _chunks(len(began.costs))]
     ended = done(_search, parts, on_progress, rounds, result.seed)
     order = np.argsort(-ended.hardness, kind="stable")
+    began, ended = began.at(order), ended.at(order)
+    climbed = _climb(policy, task, result.robot, ended.at(slice(_CLIMBING)))
+    ended = _joined([climbed, ended.at(slice(_CLIMBING, None))])
+    order = np.argsort(-ended.hardness, kind="stable")
     return began.at(order), ended.at(order)
 
 
@@ -142,11 +150,35 @@ def _search(policy: Any, task: Task, robot: str, now: Starts, rounds: int, seed:
         moved = np.minimum(1 - np.abs(1 - np.abs(moved)), np.nextafter(1.0, 0.0))  # reflected at both ends
         tried = _run(policy, task, robot, moved)
         now = _joined([now, tried]).at(n + len(n) * (tried.hardness > now.hardness))
-    for i in np.argsort(-now.hardness, kind="stable")[:_CHECKED]:
+    return _checked(task, robot, now)
+
+
+def _climb(policy: Any, task: Task, robot: str, now: Starts) -> Starts:
+    """Where gradient ascent goes from some starts."""
+    n, k = now.numbers.shape
+    most, length = np.nextafter(1.0, 0.0), np.full(n, _FIRST_CLIMB)
+    for _ in range(_CLIMBS):
+        # (2, k, n, k): each number of each start a little higher, and a little lower
+        near = np.array([[now.numbers + sign * each for each in _DIFFERENCE * np.eye(k)] for sign in (1, -1)])
+        near = np.clip(near, 0.0, most)
+        high, low = _run(policy, task, robot, near.reshape(-1, k)).hardness.reshape(2, k, n)
+        slopes = ((high - low) / (near[0] - near[1]).sum(axis=-1)).T
+        slopes /= np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
+        moved = np.clip(now.numbers + length[:, None] * slopes, 0.0, most)
+        tried = _run(policy, task, robot, moved)
+        harder = tried.hardness > now.hardness
+        now = _joined([now, tried]).at(np.arange(n) + n * harder)
+        length *= np.where(harder, 2.0, 1 / 3)
+    return _checked(task, robot, now)
+
+
+def _checked(task: Task, robot: str, starts: Starts) -> Starts:
+    """The starts, where the hardest ones have an optimum that was searched for as those of certified episodes are."""
+    for i in np.argsort(-starts.hardness, kind="stable")[:_CHECKED]:
         with suppress(PlanError):
-            cost = find_optimum(task, robot, now.states[i], now.constants[i], twice=True).cost
-            now.optima[i] = np.fmin(now.optima[i], cost)
-    return now
+            cost = find_optimum(task, robot, starts.states[i], starts.constants[i], twice=True).cost
+            starts.optima[i] = np.fmin(starts.optima[i], cost)
+    return starts
 
 
 def _joined(parts: Sequence[Starts]) -> Starts:
