@@ -15,7 +15,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import Optimum, find_optima, find_optimum
 from ballbot_baselines.optimum.batched import multistart, search_many
-from ballbot_baselines.solvers.shooting import Backoff
+from ballbot_baselines.solvers.shooting import Backoff, Shooting
 from ballbot_gym import certified, machine_code, ops
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
@@ -119,14 +119,16 @@ def test_a_second_search_finds_what_the_first_one_misses(name, episode, params):
     assert twice.cost == pytest.approx(known.costs[episode], rel=1e-6)
 
 
-def test_a_motion_that_costs_less_than_what_the_other_solver_comes_to_from_there_is_returned_itself(params):
-    task, x0 = Stabilize(), certified.load("stabilize", "paper").states[3]
-    (found,) = find_optima(task, params, x0[None], NO_CONSTANTS[None])
-    second = replace(found, cost=found.cost * (1 - 1e-5))
-    optimum = find_optimum(task, params, x0, NO_CONSTANTS, start=1.0, twice=second)
-    assert (optimum.cost, optimum.solver) == (second.cost, "ilqr")
-    np.testing.assert_array_equal(optimum.trajectory.u, found.trajectory.u)
-    assert optimum.trajectory.t[0] == 1.0
+def test_from_another_solvers_optimum_no_search_ends_at_a_higher_cost(params):
+    """Where its obstacles are touched differs from step to step, so that other optima are near."""
+    known, task = certified.load("weave", "paper"), TASKS["weave"]()
+    some = [0, 154]
+    for i, found in zip(some, find_optima(task, params, known.states[some], known.constants[some]), strict=True):
+        assert found is not None
+        near = Shooting(task, params, known.states[i], known.constants[i], Backoff()).solve_to_the_end(
+            found.trajectory.x, found.trajectory.u / params.force_limit, near=True
+        )
+        assert near[-1].cost <= found.cost * (1 + 1e-7)
 
 
 def test_the_search_from_random_guesses_fails_where_a_stored_optimum_differs_in_its_fifth_digit(tmp_path, params):

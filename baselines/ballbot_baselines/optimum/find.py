@@ -89,11 +89,6 @@ def find_optimum(
     within = [solution for solution in tried if solution.is_within_limits]
     # optima come before feasible episodes, and cheap ones before expensive ones
     best = min(within, key=lambda solution: (not solution.success, solution.cost), default=None)
-    least = best.cost if best is not None and best.success else math.inf
-    if second is not None and second.cost < least * (1 - _NO_CHEAPER):
-        # the solver of single episodes went on to a minimum nearby that costs more
-        moved = replace(second.trajectory, t=start + task.control_dt * np.arange(len(second.trajectory.x)))
-        return replace(second, trajectory=moved, seconds=time.perf_counter() - started)
     if best is None:
         tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for s in tried)
         raise PlanError(
