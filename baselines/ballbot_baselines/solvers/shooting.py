@@ -25,8 +25,8 @@ from ballbot_gym.tasks import Task
 BARRIER = 0.1
 """Of the first iterate of the solvers."""
 NEAR_BARRIER = 1e-5
-"""The same near a solution of nearly the same problem: it takes about half the iterations. From a larger one, the solution of a
-slalom goes on to a neighbouring optimum, which touches an obstacle in other steps and may cost more."""
+"""The same near a solution of nearly the same problem: it takes about half the iterations. A larger one leads from an optimum
+of a slalom to one nearby that touches an obstacle in other steps and may cost more."""
 
 FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
