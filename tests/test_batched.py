@@ -15,7 +15,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import Optimum, find_optima, find_optimum
 from ballbot_baselines.optimum.batched import multistart, search_many
-from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_baselines.solvers.shooting import SAME_BARRIER, Backoff, Shooting
 from ballbot_gym import certified, machine_code, ops
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
@@ -126,7 +126,7 @@ def test_from_another_solvers_optimum_no_search_ends_at_a_higher_cost(params):
     for i, found in zip(some, find_optima(task, params, known.states[some], known.constants[some]), strict=True):
         assert found is not None
         near = Shooting(task, params, known.states[i], known.constants[i], Backoff()).solve_to_the_end(
-            found.trajectory.x, found.trajectory.u / params.force_limit, near=True
+            found.trajectory.x, found.trajectory.u / params.force_limit, SAME_BARRIER
         )
         assert near[-1].cost <= found.cost * (1 + 1e-7)
 

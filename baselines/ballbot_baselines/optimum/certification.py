@@ -16,7 +16,7 @@ from ballbot_baselines.optimum.find import find_optimum
 from ballbot_baselines.optimum.guesses import COARSE
 from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.solvers.compiled import LANES
-from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_baselines.solvers.shooting import SAME_BARRIER, Backoff, Shooting
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
 from ballbot_gym.env import make_task
@@ -228,7 +228,7 @@ def _motion_again(
         if optimum is None:
             continue
         x, u = optimum.trajectory.x, optimum.trajectory.u
-        near = shooting.solve_to_the_end(x, u / robot.force_limit, near=True)[-1]
+        near = shooting.solve_to_the_end(x, u / robot.force_limit, SAME_BARRIER)[-1]
         motion = Trajectory(optimum.trajectory.t, near.states, robot.force_limit * near.inputs)
         same_length = len(u) == round(known.durations[i] / task.control_dt)
         if near.is_optimal and same_length and abs(near.cost - known.costs[i]) < same:

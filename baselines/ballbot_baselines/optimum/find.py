@@ -21,7 +21,7 @@ from ballbot_baselines.optimum.optimum import Optimum
 from ballbot_baselines.optimum.search import attempts
 from ballbot_baselines.solvers.ocp import Solution
 from ballbot_baselines.solvers.riccati import tube_gains
-from ballbot_baselines.solvers.shooting import Backoff, Shooting
+from ballbot_baselines.solvers.shooting import SAME_BARRIER, Backoff, Shooting
 from ballbot_gym import certified
 from ballbot_gym.checks import finite_array
 from ballbot_gym.env import make_task
@@ -241,7 +241,7 @@ def _cheaper(episode: Shooting, found: Optimum, cost: float) -> list[Solution]:
     if found.cost > cost * (1 - _NO_CHEAPER):
         return []
     trajectory = found.trajectory
-    return episode.solve_to_the_end(trajectory.x, trajectory.u / episode.params.force_limit, near=True)
+    return episode.solve_to_the_end(trajectory.x, trajectory.u / episode.params.force_limit, SAME_BARRIER)
 
 
 def plan_to_track(

@@ -73,7 +73,7 @@ def _from_states(episode: Shooting, guesses: list[tuple[np.ndarray, np.ndarray]]
             relaxed = episode.relaxed(x, u / limit, task.control_dt)
             found += episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
         else:
-            found += episode.solve_to_the_end(x, u / limit, near=False)
+            found += episode.solve_to_the_end(x, u / limit)
     return found
 
 
@@ -110,8 +110,8 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Solution]:
 def _refined(episode: Shooting, coarse: list[Solution], doubt: float, paths: list[np.ndarray]) -> list[Solution]:
     """Solves from the coarse solutions within a relative `doubt` of the best; along the paths, if there are none."""
     near = [_on_grid(solution, episode.task.steps) for solution in _distinct(coarse, doubt)]
-    starts = near or map(episode.along, paths)
-    return [solution for x, a in starts for solution in episode.solve_to_the_end(x, a, near=bool(near))]
+    starts, barrier = (near, NEAR_BARRIER) if near else (map(episode.along, paths), BARRIER)
+    return [solution for x, a in starts for solution in episode.solve_to_the_end(x, a, barrier)]
 
 
 def _on_grid(solution: Solution, steps: int) -> tuple[np.ndarray, np.ndarray]:

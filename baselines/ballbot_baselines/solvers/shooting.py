@@ -24,9 +24,11 @@ from ballbot_gym.tasks import Task
 
 BARRIER = 0.1
 """Of the first iterate of the solvers."""
-NEAR_BARRIER = 1e-5
-"""The same near a solution of nearly the same problem: it takes about half the iterations. A larger one leads from an optimum
-of a slalom to one nearby that touches an obstacle in other steps and may cost more."""
+NEAR_BARRIER = 1e-3
+"""The same near a solution of nearly the same problem: it takes about half the iterations."""
+SAME_BARRIER = 1e-5
+"""The same near a solution of the same problem. A larger one leads from an optimum of a slalom to one nearby that touches an
+obstacle in other steps and may cost more."""
 
 FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
@@ -202,18 +204,17 @@ class Shooting:
             lower[:, known], upper[:, known] = min(dt / 4, longest), longest
         return made.solve(x, a, lower, upper, self.parameters(coarseness))
 
-    def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[Solution]:
+    def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, barrier: float = BARRIER) -> list[Solution]:
         """From a guess by fatrop, and if that fails by ipopt: all solutions, the best last.
 
         Args:
             x: states.
             a: actions.
-            near: whether the guess solves nearly the same problem.
+            barrier: of the first try; near a solution less than `BARRIER`, which is tried then.
         """
-        tries = [("fatrop", NEAR_BARRIER)] if near else []
         solutions = []
-        for name, barrier in (*tries, ("fatrop", BARRIER), ("ipopt", BARRIER)):
-            solutions.append(self.solve(x, a, solver=name, barrier=barrier))
+        for name, first in dict.fromkeys((("fatrop", barrier), ("fatrop", BARRIER), ("ipopt", BARRIER))):
+            solutions.append(self.solve(x, a, solver=name, barrier=first))
             if solutions[-1].is_optimal:
                 break
         return solutions
@@ -239,7 +240,7 @@ class Shooting:
 
         def arriving(steps: int) -> list[Solution]:
             return self.solve_to_the_end(
-                *guess.motion_resampled(relaxed.states[:, :-1], relaxed.inputs, steps), near=True
+                *guess.motion_resampled(relaxed.states[:, :-1], relaxed.inputs, steps), NEAR_BARRIER
             )
 
         groups = {steps: arriving(steps)}
