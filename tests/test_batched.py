@@ -107,6 +107,15 @@ def test_no_certified_optimum_costs_more(name, params):
     assert (ratios[np.isfinite(ratios)] > 1 - 1e-4).all()
 
 
+@pytest.mark.parametrize("name", ["stabilize", "orbit"])
+def test_they_keep_a_reserve_of_force(name, params):
+    known, task = certified.load(name, "paper"), TASKS[name]()
+    found = find_optima(task, params, known.states[:20], known.constants[:20], Backoff(force=0.06))
+    assert np.isfinite(costs_of(found)).all()
+    largest = max(np.abs(optimum.trajectory.u).max() for optimum in found if optimum is not None)
+    assert largest == pytest.approx(0.94 * params.force_limit)
+
+
 @pytest.mark.parametrize(("name", "episode"), [("stabilize", 79), ("turn", 37)])
 def test_a_second_search_finds_what_the_first_one_misses(name, episode, params):
     known, task = certified.load(name, "paper"), TASKS[name]()

@@ -228,7 +228,7 @@ class _Batch:
         """
         c = (self._c if c is None else c)[of]
         _, *given = Shooting(self._task, self._params, self._x0[0], c[0], self._backoff).parameters()
-        rows = np.tile(given, (len(c), 1))
+        rows = np.tile([*given, 1 - self._backoff.force], (len(c), 1))
         first = len(self._params.numbers())
         rows[:, first : first + c.shape[1]] = c
         if free_time:

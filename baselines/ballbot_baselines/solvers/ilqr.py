@@ -39,7 +39,6 @@ MARGIN = 2e-5
 
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
 _LEAST_CURVATURE = 1e-9  # of the cost along an action, so that steps of no length have a best one
-_LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
 _REST = 8 + 36 + 1  # parameters of LQR's cost-to-go: a state, the upper triangle of P, and its share
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
@@ -181,8 +180,9 @@ class _Ilqr:
         Args:
             guesses: of the solutions.
             length: of a step, s; 1 where it is free.
-            given: (J, np) parameters: p of `ocp_of` but the first, and the bounds of a free length, s, or else, for
-                tasks with a `rest`, a state (8,), P's upper triangle (36,), and the share of LQR's cost-to-go that counts.
+            given: (J, np) parameters: p of `ocp_of` but the first, the largest action, and the bounds of a free length, s, or
+                else, for tasks with a `rest`, a state (8,), P's upper triangle (36,), and the share of LQR's cost-to-go that
+                counts.
             options: of the solver, for each problem.
             multipliers, end_multipliers: (J, n, path constraints) and (J, constraints of the end) at first, of a solution of
                 nearly the same problem; default, the option.
@@ -256,10 +256,10 @@ class _Stage:
         self._free, self.ns, self._rests = free_time, 9 if free_time else 8, rests
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
-        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
+        self._p = symbol("p", self._ocp.params + 2 * free_time + _REST * rests)
         self._all = casadi.vertcat(self._x[8] if free_time else self._dt, self._p[: self._ocp.params - 1])
         self._robot: Any = kind.model(self._all[1 : 1 + len(kind.numbers)])
-        self._limit = self._robot.force_limit
+        self._limit, self._largest = self._robot.force_limit, self._p[self._ocp.params - 1]
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
         path, end = (
@@ -314,10 +314,10 @@ class _Stage:
         # `push` is 0 in steps of no length, because their multipliers are
         slope = slope + linear.T @ slope_ahead - of_limits.T @ push
         hessian = of_cost + linear.T @ value @ linear + of_limits.T @ casadi.diag(stiffness) @ of_limits
-        over = casadi.vertcat(*(a[i] - _clipped(a[i]) for i in range(2)))
+        over = casadi.vertcat(*(a[i] - self._clipped(a[i]) for i in range(2)))
         of_action = hessian[ns:, ns:] + casadi.diag(_LEAST_CURVATURE + damping + _OVER * (over != 0))
         of_change, mixed = slope[ns:] + _OVER * over, hessian[ns:, :ns]
-        bound = _LARGEST_ACTION + 1e9 * open_
+        bound = self._largest + 1e9 * open_
         change, inverse = _box_step(of_action, of_change, -bound - a, bound - a)
         feedback = inverse @ mixed
         moved = of_action @ change + of_change
@@ -352,7 +352,7 @@ class _Stage:
         """The feedback's action held for a control step: the next state, action, cost, constraints and their price."""
         about = casadi.SX.sym("about", self.ns)
         wanted = self._a + self._share * self._step - self._feedback(self._x - about)
-        taken = casadi.vertcat(*(_clipped(wanted[i]) for i in range(2)))
+        taken = casadi.vertcat(*(self._clipped(wanted[i]) for i in range(2)))
         limits, cost = self._ocp.inequalities(self._x, taken, self._all), self._ocp.cost(self._x, taken, self._all)
         price = casadi.sum1(_price(limits, self._multipliers, self._width))
         return _block(
@@ -392,6 +392,9 @@ class _Stage:
         force = righting.steering(self._robot, x, aside, settings[0], settings[1], target, limit)
         return _block("steer", (self._x, path, settings, self._p), (casadi.vertcat(*force) / limit,))
 
+    def _clipped(self, a: casadi.SX) -> casadi.SX:
+        return ops.clip(a, -self._largest, self._largest)
+
     def _feedback(self, off: casadi.SX) -> casadi.SX:
         return casadi.reshape(self._gain, self.ns, 2).T @ off
 
@@ -403,10 +406,6 @@ def _block(name: str, inputs: Sequence[casadi.SX], outputs: Sequence[casadi.SX])
     return codegen.block(
         name, *([(f"{kind}{i}", part) for i, part in enumerate(some)] for kind, some in zip("io", parts, strict=True))
     )
-
-
-def _clipped(a: casadi.SX) -> casadi.SX:
-    return ops.clip(a, -_LARGEST_ACTION, _LARGEST_ACTION)
 
 
 def _price(limits: casadi.SX, multipliers: casadi.SX, width: casadi.SX) -> casadi.SX:

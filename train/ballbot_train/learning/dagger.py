@@ -74,9 +74,8 @@ _FEW = DaggerConfig(iterations=20, evaluations=5, batch_size=256, learning_rate=
 TUNED: dict[str, DaggerConfig] = {
     "": DaggerConfig(),
     "stabilize": replace(_FEW, gathering_iterations=4, gradient_steps=1000, symmetry="odd"),
-    "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip)),
-    # plans at the force limit leave no force for corrections
-    "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred", backoff=Backoff(force=0.06, grip=EXECUTED.grip)),
+    "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, grip=EXECUTED.grip)),
+    "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred"),
     "weave": replace(
         _FEW,
         gathering_iterations=5,
@@ -84,7 +83,7 @@ TUNED: dict[str, DaggerConfig] = {
         learning_rate=5e-3,
         hidden=(128, 128),
         symmetry="routes",
-        backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip),
+        backoff=Backoff(margin=0.06, grip=EXECUTED.grip),
     ),
 }
 """Exceptions by name of task; every other task takes the defaults."""
