@@ -5,7 +5,6 @@ The theorem is at the top of `proofs/planar_bound.c`, and its numbers are in `lo
 
 import hashlib
 import json
-import math
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -29,7 +28,7 @@ class PlanarBound:
     """
 
     t: list[list[float]]
-    """(4, 4) upper triangular: states x are T z."""
+    """(4, 4) upper triangular: states x are T z. V is only used where zᵀz is at most 1."""
     gain: list[float]
     """(4,) forces are near gain · z. Any numbers are right; good ones save boxes."""
     exponents: list[list[int]]
@@ -38,10 +37,6 @@ class PlanarBound:
     """(m,) of these monomials."""
     rho: float
     """The bound holds where V < rho."""
-    outer: float
-    """V is only used where its quadratic part is at most this."""
-    share: float
-    """V is at least this share of its quadratic part."""
     delta: float
     """V is at most this in the goal."""
     knots: list[tuple[float, float]]
@@ -89,21 +84,18 @@ class PlanarBound:
         least = float("nan") if plane is None else float(self.bound(plane[None], task.steps)[0])
         return least if least > 0 else float("nan")
 
-    def value(self, x: np.ndarray, degree: float = math.inf) -> np.ndarray:
-        """(n,) V of planar states (n, 4), rounded, or its part up to a degree."""
-        z = np.linalg.solve(np.array(self.t), x.T)[:, :, None]
-        exponents = np.array(self.exponents).T
-        kept = exponents.sum(0) <= degree
-        return np.prod(z ** exponents[:, None, kept], 0) @ np.array(self.coefficients)[kept]
+    def value(self, x: np.ndarray) -> np.ndarray:
+        """(n,) V of planar states (n, 4), rounded."""
+        return np.prod(self._z(x)[:, :, None] ** np.array(self.exponents).T[:, None], 0) @ np.array(self.coefficients)
 
     def bound(self, x: np.ndarray, steps: int) -> np.ndarray:
         """(n,) lower bounds of the cost of successful episodes of some steps from planar states (n, 4).
 
         NaN where none is proven.
         """
-        v, a = self.value(x), self.schedule(steps)
+        v, a, z = self.value(x), self.schedule(steps), self._z(x)
         bound = np.maximum(a * v, v - self.delta)
-        inside = (self.value(x, 2) < self.outer) & (v < self.rho) & (bound <= self.rho - self.delta)
+        inside = (np.sum(z**2, 0) < 1) & (v < self.rho) & (bound <= self.rho - self.delta)
         return np.where(inside, bound, np.nan)
 
     def until(self) -> list[float]:
@@ -118,6 +110,10 @@ class PlanarBound:
         for _ in range(steps):
             a = min(1.0, a + self._dt() * float(np.interp(a, slopes[:, 0], slopes[:, 1])) * (1 - 1e-12))
         return a - 1e-9 * (a < 1)
+
+    def _z(self, x: np.ndarray) -> np.ndarray:
+        """(4, n) of planar states (n, 4)."""
+        return np.linalg.solve(np.array(self.t), x.T)
 
     def _dt(self) -> float:
         return Stabilize().control_dt

@@ -1,22 +1,22 @@
 /* Checks a lower bound of the cost of every successful episode of Stabilize in a vertical plane, from V's coefficients alone.
 
 States are x = (position, lean, speed, lean rate) = T z, forces u. F is a control step as the environment computes it: two RK4
-steps of dt/2 with the force held. l is the cost rate. V is an even polynomial of degree at most 8 in z, and V2 its quadratic
-part, which is positive definite. With D = {V2 <= outer, V < rho} and k control steps left, let
+steps of dt/2 with the force held. l is the cost rate. V is an even polynomial of degree at most 8 in z, and Q = z'z. V is
+used where Q <= 1. With D = {Q <= 1, V < rho} and k control steps left, let
 
     W_k(x) = min(max(V(x) - delta, a_k V(x)), rho - delta) in D, else rho - delta,   a_0 = 0,  a_k+1 = min(1, a_k + dt r(a_k)),
 
-where r is piecewise linear between knots, the last of which is a = 1, and V <= delta < rho in the goal, which lies in {V2 <= outer}.
+where r is piecewise linear between knots, the last of which is a = 1, and V <= delta < rho and Q <= 1 in the goal.
 If W_k+1(x) <= dt l(x, u) + W_k(F(x, u)) for all x and F(x, u) inside the limits and all |u| <= limit, then an episode of n steps
 that ends in the goal costs at least W_n(x_0), because W_0 = 0 in the goal. It is enough that
 
-  (A) V >= share V2 or V >= rho, for all z with V2 <= outer, and for all x inside the limits and all |u| <= limit
-  (B) dt l >= rho, or dt l + V(F) >= rho, or dt l + share V2(F) >= rho, or V2 <= outer and either dt l >= V or, for every knot with
+  (A) V >= 0 for all x inside the limits with Q <= 1, and for all x inside the limits and all |u| <= limit
+  (B) dt l >= rho, or dt l + V(F) >= rho, or Q(F) > 1, or Q <= 1 and either dt l >= V or, for every knot with
       V < until, a (V(F) - V)/dt + l >= r V.   `until` is at least delta/(1 - a') for all a' between the knot and what follows the next one.
 
-Reasons: 0 <= W_k <= rho - delta. Where W_k(F) = rho - delta nothing is to be shown. Else F is in D, and W_k(F) is at least V(F) - delta,
-share V2(F) - delta and a_k V(F). If x is in {V2 <= outer} but not in D, the last knot gives dt l + V(F) >= V >= rho. If x is in D, then
-W_k+1(x) is V - delta, and the last knot is enough, or it is a_k+1 V with V <= delta/(1 - a_k+1), and the knots about a_k are.
+Reasons: 0 <= W_k <= rho - delta. Where W_k(F) = rho - delta, as where Q(F) > 1, nothing is to be shown. Else F is in D, and W_k(F)
+is at least V(F) - delta, a_k V(F) and 0. If Q <= 1 but x is not in D, the last knot gives dt l + V(F) >= V >= rho. If x is in D,
+then W_k+1(x) is V - delta, and the last knot is enough, or it is a_k+1 V with V <= delta/(1 - a_k+1), and the knots about a_k are.
 
 z = s y with max |y_i| = 1 and sigma = s^2, and u = s (gain y + w). Since F is odd and V even, all of (A) and (B) can be divided by
 sigma, and what remains is smooth in (sigma, y, w) down to sigma = 0. A box is an interval of each of sigma, three components of y
@@ -48,7 +48,7 @@ static real where(mask k, real a, real b) { return (real)((k & (mask)a) | (~k & 
 
 typedef struct {
     double mass, moment, inertia, gravity, dt, limit, reach[4], state_cost[4], force_cost; /* reach: of position and lean, and 0 */
-    double t[4][4], gain[4], widest, rho, outer, share, a[KNOTS], r[KNOTS], until[KNOTS]; /* |w| <= widest in the boxes */
+    double t[4][4], gain[4], widest, rho, a[KNOTS], r[KNOTS], until[KNOTS]; /* |w| <= widest in the boxes */
     double c2[10], c4[35], c6[35][10], c8[35][35]; /* of products of i <= j <= ... of z: the first two or four, then the rest */
     int64_t knots;
 } problem;
@@ -60,12 +60,15 @@ typedef struct { real c[TERMS], r; int top; } model; /* no term has a degree abo
 
 static real norm(const model *a, real by[ORDER + 1]) { /* the sum of |c|, and the sums of each degree */
     real sum = all(0);
-    EACH(d, ORDER + 1) {
-        real s = all(0);
-        if (d <= a->top) for (int k = from[d]; k < from[d + 1]; k++) s += size(a->c[k]);
-        if (by) by[d] = s;
-        sum += s;
+    EACH(d, a->top + 1) {
+        real s[4] = {all(0), all(0), all(0), all(0)}; /* four sums at once, because each addition waits for the last one */
+        int k = from[d];
+        for (; k + 4 <= from[d + 1]; k += 4) EACH(i, 4) s[i] += size(a->c[k + i]);
+        for (; k < from[d + 1]; k++) s[0] += size(a->c[k]);
+        s[0] = (s[0] + s[1]) + (s[2] + s[3]), sum += s[0];
+        if (by) by[d] = s[0];
     }
+    if (by) for (int d = a->top + 1; d <= ORDER; d++) by[d] = all(0);
     return sum;
 }
 static void number(model *out, double a) {
@@ -74,8 +77,14 @@ static void number(model *out, double a) {
 }
 static void add(model *out, const model *a, double s, const model *b) { /* a + s b */
     int top = a->top > b->top ? a->top : b->top;
-    real r = a->r + fabs(s) * b->r + ROUND * (norm(a, 0) + fabs(s) * norm(b, 0));
-    EACH(k, TERMS) out->c[k] = a->c[k] + s * b->c[k];
+    real sum[7];
+    EACH(i, 7) sum[i] = all(0);
+    EACH(n, TERMS / 7) EACH(i, 7) {
+        int k = 7 * n + i;
+        sum[i] += size(a->c[k]) + fabs(s) * size(b->c[k]);
+        out->c[k] = a->c[k] + s * b->c[k];
+    }
+    real r = a->r + fabs(s) * b->r + ROUND * ((sum[0] + sum[1] + sum[2]) + (sum[3] + sum[4] + sum[5] + sum[6]));
     out->r = r * SLACK, out->top = top;
 }
 static void divide(model *a, real s) {
@@ -86,19 +95,23 @@ static void scale(model *a, double s) {
     EACH(k, TERMS) a->c[k] *= s;
     a->r = (a->r * fabs(s) + ROUND * norm(a, 0)) * SLACK;
 }
-static void times(model *out, const model *a, const model *b) {
+static void times(model *out, const model *a, const model *b) { /* faster if a has few terms */
     if (a->top > b->top) { const model *other = a; a = b, b = other; }
-    real p[TERMS], na[ORDER + 1], nb[ORDER + 1], sa = norm(a, na), sb = norm(b, nb), lost = all(0);
-    int top = a->top + b->top < ORDER ? a->top + b->top : ORDER;
-    EACH(k, TERMS) p[k] = all(0);
-    EACH(i, from[a->top + 1]) {
+    int top = a->top + b->top < ORDER ? a->top + b->top : ORDER, apart = out != a && out != b;
+    real room[TERMS], *p = apart ? out->c : room;
+    real na[ORDER + 1], nb[ORDER + 1], sa = norm(a, na), sb = norm(b, nb), lost = all(0);
+    EACH(k, TERMS) p[k] = a->c[0] * b->c[k];
+    for (int i = 1; i < from[a->top + 1]; i++) {
         int most = ORDER - degree_of[i], end = from[(most < b->top ? most : b->top) + 1];
-        EACH(j, end) p[product[i][j]] += a->c[i] * b->c[j];
+        real ai = a->c[i];
+        int64_t any = ((mask)ai)[0];
+        if (!any) EACH(l, LANES) any |= ((mask)ai)[l];
+        if (any) EACH(j, end) p[product[i][j]] += ai * b->c[j];
     }
     EACH(d, ORDER + 1) for (int e = ORDER + 1 - d; e <= ORDER; e++) lost += na[d] * nb[e];
-    real r = (lost + a->r * (sb + b->r) + b->r * sa + ROUND * sa * sb) * SLACK;
-    EACH(k, TERMS) out->c[k] = p[k];
-    out->r = r, out->top = top;
+    out->r = (lost + a->r * (sb + b->r) + b->r * sa + ROUND * sa * sb) * SLACK;
+    if (!apart) EACH(k, TERMS) out->c[k] = p[k];
+    out->top = top;
 }
 static void range(const model *a, real *low, real *high) {
     real sum = (norm(a, 0) - size(a->c[0]) + a->r + ROUND * norm(a, 0)) * SLACK;
@@ -107,20 +120,20 @@ static void range(const model *a, real *low, real *high) {
 }
 
 static double series[2][5][16]; /* k-th Taylor coefficients of sin(a)/a and of cos(a) as power series of t = a^2 */
-static void sine_cosine(const model *t, model *s, model *c) { /* |t| <= 3: of degree 3 about its middle, and a remainder */
+static void sine_cosine(const model *t, model *s, model *c) { /* |t| <= 10: of degree 3 about its middle, and a remainder */
     model d = *t, d2, d3;
     d.c[0] = all(0);
-    real far = (norm(&d, 0) + d.r) * SLACK, outside = where(size(t->c[0]) + far < 3, all(0), all(INFINITY));
+    real far = (norm(&d, 0) + d.r) * SLACK, outside = where(size(t->c[0]) + far < 10, all(0), all(INFINITY));
     times(&d2, &d, &d), times(&d3, &d2, &d);
     EACH(f, 2) {
         model *out = f ? c : s;
         real at[4];
-        double most = 0; /* of the fourth coefficient where |t| <= 3 */
+        double most = 0; /* of the fourth coefficient where |t| <= 10 */
         EACH(k, 4) {
             at[k] = all(0);
             for (int j = 15; j >= k; j--) at[k] = at[k] * t->c[0] + series[f][k][j];
         }
-        for (int j = 15; j >= 4; j--) most = most * 3 + fabs(series[f][4][j]);
+        for (int j = 15; j >= 4; j--) most = most * 10 + fabs(series[f][4][j]);
         EACH(k, TERMS) out->c[k] = at[1] * d.c[k] + at[2] * d2.c[k] + at[3] * d3.c[k];
         out->c[0] += at[0], out->top = ORDER;
         out->r = size(at[1]) * d.r + size(at[2]) * d2.r + size(at[3]) * d3.r + 1.01 * most * far * far * far * far;
@@ -179,7 +192,7 @@ static void step(const model *sigma, const model x[4], const model *force, model
     }
 }
 
-/* V/sigma and V2/sigma, each with its change in a step over dt, so that nothing cancels */
+/* V/sigma and Q/sigma, each with its change in a step over dt, so that nothing cancels */
 typedef struct { model at, change; } pair;
 static void pair_times(pair *out, const pair *a, const pair *b) {
     model after, p, q;
@@ -189,15 +202,15 @@ static void pair_times(pair *out, const pair *a, const pair *b) {
 static void pair_add(pair *out, double s, const pair *b) {
     add(&out->at, &out->at, s, &b->at), add(&out->change, &out->change, s, &b->change);
 }
-static void values(const model *sigma, const pair z[4], pair *v, pair *v2) {
-    static _Thread_local pair q[10], two[10], four[35], middle, rest, t, zero; /* two and four: of z, as q times sigma */
+static void value(const model *sigma, const pair z[4], pair *v) {
+    static _Thread_local pair one[10], two[10], four[35], middle, rest, t, zero; /* one: products of two z; two: those times sigma */
     int n = 0, a = 0, of[4][4];
-    number(&zero.at, 0), number(&zero.change, 0), *v2 = zero;
+    number(&zero.at, 0), number(&zero.change, 0), *v = zero;
     EACH(i, 4) for (int j = i; j < 4; j++, n++) {
-        of[i][j] = n, pair_times(&q[n], &z[i], &z[j]), pair_add(v2, P.c2[n], &q[n]);
-        times(&two[n].at, sigma, &q[n].at), times(&two[n].change, sigma, &q[n].change);
+        of[i][j] = n, pair_times(&one[n], &z[i], &z[j]), pair_add(v, P.c2[n], &one[n]);
+        times(&two[n].at, sigma, &one[n].at), times(&two[n].change, sigma, &one[n].change);
     }
-    *v = *v2, n = 0;
+    n = 0;
     EACH(i, 4) for (int j = i; j < 4; j++) for (int k = j; k < 4; k++) for (int l = k; l < 4; l++, n++)
         pair_times(&four[n], &two[of[i][j]], &two[of[k][l]]);
     EACH(i, 4) for (int j = i; j < 4; j++) {
@@ -208,7 +221,7 @@ static void values(const model *sigma, const pair z[4], pair *v, pair *v2) {
             EACH(b, 35) if (P.c8[a][b]) pair_add(&rest, P.c8[a][b], &four[b]);
             pair_times(&t, &two[of[k][l]], &rest), pair_add(&middle, 1, &t);
         }
-        pair_times(&t, &q[of[i][j]], &middle), pair_add(v, 1, &t);
+        pair_times(&t, &one[of[i][j]], &middle), pair_add(v, 1, &t);
     }
 }
 
@@ -262,21 +275,23 @@ static span row_times_y(const box *b, const double row[4]) {
     return (span){mid - radius, mid + radius};
 }
 static double least_square(span a) { double m = fmax(fmax(a.low, -a.high), 0); return m * m * (1 - 1e-12); }
-static int needless(const box *b) { /* no state of the box is inside the limits and has a step that costs less than rho */
+static int needless(const box *b, int moves) { /* no state is inside the limits, or, for (B), none has a step that costs less than rho */
     double least = 0, sigma = b->mid[0] - b->half[0];
     EACH(i, 4) {
         double q = least_square(row_times_y(b, P.t[i]));
         least += P.state_cost[i] * q;
         if (P.reach[i] && q * sigma > P.reach[i] * P.reach[i] * SLACK) return 1;
     }
+    if (!moves) return 0;
     span u = row_times_y(b, P.gain);
     u.low += b->mid[4] - b->half[4], u.high += b->mid[4] + b->half[4];
     double q = least_square((span){u.low - 1e-9, u.high + 1e-9});
     return q * sigma > P.limit * P.limit * SLACK || P.dt * (least + P.force_cost * q) * sigma * (1 - 1e-12) >= P.rho;
 }
 
-typedef struct { model sigma, x[4], force, cost; pair z[4], v, v2; } motion;
-static void enclose(const box b[LANES], int moves, motion *m) {
+typedef struct { model sigma, x[4], force, cost; pair z[4], v, q; } motion;
+static void enclose(const box b[LANES], int moves, motion *m) { /* all but V */
+    static _Thread_local pair square;
     number(&m->sigma, 0), number(&m->force, 0), number(&m->cost, 0);
     m->sigma.top = m->force.top = 1;
     EACH(i, 4) {
@@ -305,7 +320,38 @@ static void enclose(const box b[LANES], int moves, motion *m) {
             divide(&dx[i], all(P.t[i][i])), m->z[i].change = dx[i];
         }
     }
-    values(&m->sigma, m->z, &m->v, &m->v2);
+    number(&m->q.at, 0), number(&m->q.change, 0);
+    EACH(i, 4) pair_times(&square, &m->z[i], &m->z[i]), pair_add(&m->q, 1, &square);
+}
+
+/* dt l + V(F) - rho, or rho Q(F) - rho, which says nothing of l, both divided by dt sigma */
+static void beyond(const motion *m, const pair *after, double by, real low, real high, verdict *out) {
+    static _Thread_local model g;
+    /* rho/sigma lies below its chord, by `sag` in the middle */
+    real most = P.rho / P.dt / low, least = P.rho / P.dt / high, sag = 0.5 * (most + least) - P.rho / P.dt / m->sigma.c[0];
+    if (after == &m->v) g = m->cost; else number(&g, 0);
+    add(&g, &g, by, &after->change), add(&g, &g, by / P.dt, &after->at);
+    g.c[0] -= 0.5 * (most + least), g.c[1] += 0.5 * (most - least), g.r += 1e-11 * (most + norm(&g, 0)), g.top = ORDER;
+    judge(&g, out);
+    out->part[0] += sag;
+}
+/* What is known of boxes, and which side to halve: where no model is finite, what makes the lean vary most */
+static void choose(const box b[LANES], const verdict *worst, int moves, mask inside, mask done, mask wrong, int *proven, int *refuted,
+                   int *axis) {
+    EACH(l, LANES) {
+        double largest = -1, width[VARS] = {b[l].half[0] / b[l].mid[0] / 2, 0, 0, 0, b[l].half[4] / 4e4};
+        EACH(i, 4) if (i != b[l].face) {
+            int n = 1 + i - (i > b[l].face);
+            width[n] = b[l].half[n] * (fabs(P.t[1][i]) + P.dt * fabs(P.t[3][i]) + 1e-3);
+        }
+        proven[l] = done[l] != 0, refuted[l] = wrong[l] != 0;
+        EACH(i, moves ? VARS : 4) {
+            double part = isfinite(worst->low[l]) ? worst->part[i][l] : width[i];
+            if (part > largest) largest = part, axis[l] = i;
+        }
+        double force = b[l].half[4]; /* outside of D little is proven for a wide range of forces */
+        if (moves && !inside[l] && force * force * b[l].mid[0] > 4e4) axis[l] = 4;
+    }
 }
 
 /* Of LANES boxes: whether (A) (moves = 0) or (B) is proven, whether it cannot be, and which side to halve. */
@@ -315,60 +361,62 @@ static void examine(const box b[LANES], int moves, int *proven, int *refuted, in
     real v_low, v_high, q_low, q_high, l_low, l_high, low = all(0), high = all(0);
     EACH(l, LANES) low[l] = (b[l].mid[0] - b[l].half[0]) * (1 - 1e-12), high[l] = (b[l].mid[0] + b[l].half[0]) * SLACK;
     enclose(b, moves, &m);
-    range(&m.v.at, &v_low, &v_high), range(&m.v2.at, &q_low, &q_high), range(&m.cost, &l_low, &l_high);
+    range(&m.q.at, &q_low, &q_high), range(&m.cost, &l_low, &l_high);
     verdict worst, one;
-    mask done, wrong = (mask)all(0);
+    mask done, wrong = (mask)all(0), inside = q_high * high <= 1;
     if (!moves) {
-        add(&g, &m.v.at, -P.share, &m.v2.at), judge(&g, &worst);
-        done = (worst.low >= 0) | (v_low * low >= P.rho) | (q_low * low >= P.outer);
-    } else {
-        mask inside = q_high * high <= P.outer;
-        /* l + V(F)/dt >= rho/dt, and the same with share V2; rho/sigma lies below its chord, by `sag` in the middle */
-        real most = P.rho / P.dt / low, least = P.rho / P.dt / high, sag = 0.5 * (most + least) - P.rho / P.dt / m.sigma.c[0];
-        EACH(n, 2) {
-            const pair *v = n ? &m.v2 : &m.v;
-            double s = n ? P.share : 1;
-            add(&g, &m.cost, s, &v->change), add(&g, &g, s / P.dt, &v->at);
-            g.c[0] -= 0.5 * (most + least), g.c[1] += 0.5 * (most - least), g.r += 1e-11 * (most + norm(&g, 0)), g.top = ORDER;
-            judge(&g, n ? &one : &worst);
-        }
-        mask second = ~(worst.low >= one.low);
-        worst.low = where(second, one.low, worst.low), worst.middle = where(one.middle > worst.middle, one.middle, worst.middle);
-        EACH(i, VARS) worst.part[i] = where(second, one.part[i], worst.part[i]) + (i ? all(0) : sag);
-        mask enough = worst.low >= 0, every = inside, first = ~(mask)all(0);
-        mask mixed = ~inside & (q_low * low < P.outer) & ~(worst.middle >= 0);
-        EACH(i, VARS) { /* where neither way holds for all of the box, halve what makes V2 vary */
-            real part = i ? all(0) : (high - low) / (high + low) * m.v2.at.c[0];
-            for (int k = 1; k < TERMS; k++) part += power[k][i] * size(m.v2.at.c[k]);
-            worst.part[i] = where(mixed, part, worst.part[i]);
-        }
-        EACH(n, P.knots) {
-            mask needed = v_low * low < P.until[n];
-            g = m.cost, add(&g, &g, P.a[n], &m.v.change), add(&g, &g, -P.r[n], &m.v.at), judge(&g, &one);
-            every &= ~needed | (one.low >= 0);
-            wrong |= inside & needed & (v_high * high < P.until[n]) & (one.middle < 0) & ~(worst.middle >= 0);
-            mask worse = inside & needed & ~(one.low >= 0) & (first | (one.low < worst.low));
-            worst.low = where(worse, one.low, worst.low);
-            EACH(i, VARS) worst.part[i] = where(worse, one.part[i], worst.part[i]);
-            first &= ~worse;
-        }
-        done = enough | every | (inside & (P.dt * l_low * (1 - 1e-12) >= v_high));
-        double least_force = P.widest; /* of w beyond all boxes: such a step costs too much, or is impossible */
-        EACH(j, 4) least_force -= fabs(P.gain[j]);
-        double force2 = least_force * least_force * (1 - 1e-12);
-        real worth = P.rho / low;
-        worth = where(inside & (v_high < worth), v_high, worth);
-        done &= (worth <= P.dt * P.force_cost * force2) | (force2 * low >= P.limit * P.limit);
-        wrong &= ~done & (v_high * high < P.rho) & (P.dt * l_high < v_low);
+        value(&m.sigma, m.z, &m.v), judge(&m.v.at, &worst);
+        done = (worst.low >= 0) | (q_low * low > 1);
+        choose(b, &worst, moves, inside, done, wrong, proven, refuted, axis);
+        return;
     }
-    EACH(l, LANES) {
-        double largest = -1, width[VARS] = {b[l].half[0] / b[l].mid[0], b[l].half[1], b[l].half[2], b[l].half[3], b[l].half[4] / 400};
-        proven[l] = done[l] != 0, refuted[l] = wrong[l] != 0;
-        EACH(i, moves ? VARS : 4) {
-            double part = isfinite(worst.low[l]) ? worst.part[i][l] : width[i];
-            if (part > largest) largest = part, axis[l] = i;
-        }
+    double least_force = P.widest; /* of w beyond all boxes: such a step costs too much, or is impossible */
+    EACH(j, 4) least_force -= fabs(P.gain[j]);
+    double force2 = least_force * least_force * (1 - 1e-12);
+    mask bounded = (P.rho / low <= P.dt * P.force_cost * force2) | (force2 * low >= P.limit * P.limit);
+    beyond(&m, &m.q, P.rho, low, high, &one);
+    /* far from D, V is a help in small boxes only */
+    mask enough = one.low > 0, rough = ~(one.low > -INFINITY);
+    rough |= (q_low * low > 1) & (one.middle > 0) & (one.low * low < -0.3 * P.rho / P.dt);
+    int all_rough = 1;
+    EACH(l, LANES) all_rough &= (enough[l] & bounded[l]) || rough[l];
+    if (all_rough) {
+        choose(b, &one, moves, inside, enough & bounded, wrong, proven, refuted, axis);
+        return;
     }
+    value(&m.sigma, m.z, &m.v), range(&m.v.at, &v_low, &v_high);
+    beyond(&m, &m.v, 1, low, high, &worst);
+    mask second = ~(worst.low >= one.low);
+    worst.low = where(second, one.low, worst.low), worst.middle = where(one.middle > worst.middle, one.middle, worst.middle);
+    EACH(i, VARS) worst.part[i] = where(second, one.part[i], worst.part[i]);
+    enough = worst.low > 0;
+    mask every = inside, first = ~(mask)all(0), mixed = ~inside & (q_low * low < 1) & ~(worst.middle >= 0);
+    EACH(i, VARS) { /* where neither way holds for all of the box, halve what makes Q vary */
+        real part = i ? all(0) : (high - low) / (high + low) * m.q.at.c[0];
+        for (int k = 1; k < TERMS; k++) part += power[k][i] * size(m.q.at.c[k]);
+        worst.part[i] = where(mixed, part, worst.part[i]);
+    }
+    EACH(n, P.knots) {
+        mask needed = v_low * low < P.until[n], asked = needed & inside & ~enough;
+        int any = 0;
+        EACH(l, LANES) any |= asked[l] != 0;
+        if (!any) continue;
+        add(&g, &m.cost, P.a[n], &m.v.change), add(&g, &g, -P.r[n], &m.v.at), judge(&g, &one);
+        every &= ~needed | (one.low >= 0);
+        wrong |= inside & needed & (v_high * high < P.until[n]) & (one.middle < 0) & ~(worst.middle >= 0);
+        mask worse = asked & ~(one.low >= 0) & (first | (one.low < worst.low));
+        worst.low = where(worse, one.low, worst.low);
+        EACH(i, VARS) worst.part[i] = where(worse, one.part[i], worst.part[i]);
+        first &= ~worse;
+    }
+    done = enough | every | (inside & (P.dt * l_low * (1 - 1e-12) >= v_high));
+    real worth = P.rho / low;
+    worth = where(inside & (v_high < worth), v_high, worth);
+    done &= bounded | (worth <= P.dt * P.force_cost * force2);
+    wrong &= ~done & (v_high * high < P.rho) & (P.dt * l_high < v_low);
+    wrong &= m.force.c[0] * m.force.c[0] * m.sigma.c[0] < P.limit * P.limit; /* the middle of a box may be beyond the limits */
+    EACH(i, 4) if (P.reach[i]) wrong &= m.x[i].c[0] * m.x[i].c[0] * m.sigma.c[0] < P.reach[i] * P.reach[i];
+    choose(b, &worst, moves, inside, done, wrong, proven, refuted, axis);
 }
 
 void prepare(const problem *given) {
@@ -407,7 +455,7 @@ int64_t check(const box *root, int64_t moves, int64_t most_boxes, int64_t *boxes
         int n = 0;
         while (n < LANES && filled) {
             b[n] = stack[--filled], done++;
-            n += !moves || !needless(&b[n]);
+            n += !needless(&b[n], (int)moves);
         }
         if (!n) continue;
         for (int i = n; i < LANES; i++) b[i] = b[0];
@@ -432,7 +480,7 @@ void look(const box *root, double *out) {
     static motion m;
     box b[LANES];
     EACH(l, LANES) b[l] = *root;
-    enclose(b, 1, &m);
+    enclose(b, 1, &m), value(&m.sigma, m.z, &m.v);
     const model *models[3] = {&m.v.change, &m.cost, &m.v.at};
     EACH(i, 3) {
         EACH(k, TERMS) *out++ = models[i]->c[k][0];

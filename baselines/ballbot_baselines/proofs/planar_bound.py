@@ -24,7 +24,7 @@ from ballbot_gym.tasks.stabilize import Stabilize
 
 _PAIRS, _FOURS = (list(itertools.combinations_with_replacement(range(4), n)) for n in (2, 4))
 _KNOTS = 16
-_WIDEST = 1024.0
+_WIDEST = 4096.0
 _FLAGS = ("-O3",)
 
 
@@ -37,7 +37,7 @@ class _Problem(ctypes.Structure):
         ("force_cost", ctypes.c_double),
         ("t", ctypes.c_double * 16),
         ("gain", ctypes.c_double * 4),
-        *((name, ctypes.c_double) for name in ("widest", "rho", "outer", "share")),
+        *((name, ctypes.c_double) for name in ("widest", "rho")),
         *((name, ctypes.c_double * _KNOTS) for name in ("a", "r", "until")),
         ("c2", ctypes.c_double * 10),
         ("c4", ctypes.c_double * 35),
@@ -71,7 +71,7 @@ def _problem(certificate: PlanarBound) -> _Problem:
     out.reach[0], out.reach[1] = task.arena_radius, task.max_tilt
     out.state_cost[:] = [task.position_weight, *[task.rest_weight] * 3]
     out.t[:], out.gain[:] = np.ravel(certificate.t).tolist(), certificate.gain
-    out.rho, out.outer, out.share = certificate.rho, certificate.outer, certificate.share
+    out.rho = certificate.rho
     for i, ((a, r), until) in enumerate(zip(certificate.knots, certificate.until(), strict=True)):
         out.a[i], out.r[i], out.until[i] = a, r, until
     for e, c in zip(certificate.exponents, certificate.coefficients, strict=True):
@@ -106,8 +106,9 @@ def _check_numbers(certificate: PlanarBound) -> int:
         "T is upper triangular": all(t[i][j] == 0 for i in range(4) for j in range(i)),
         "the quadratic part of V is positive definite": _is_positive(quadratic),
         "V is at most delta in the goal": most + higher <= Fraction(certificate.delta),
-        "the goal lies where V is used": most <= Fraction(certificate.outer),
+        "the goal lies where V is used": max(sum(z * z for z in corner) for corner in _corners(certificate)) <= 1,
         "delta is less than rho": certificate.delta < certificate.rho,
+        "the boxes of forces reach beyond the gain": sum(map(abs, certificate.gain)) < _WIDEST / 2,
         "the knots rise from 0 to 1, with slopes >= 0": a[0] == 0
         and a[-1] == 1
         and sorted(a) == list(a)
@@ -115,9 +116,7 @@ def _check_numbers(certificate: PlanarBound) -> int:
     }
     if wrong := [name for name, right in holds.items() if not right]:
         raise ArithmeticError(f"it is not true that {' and that '.join(wrong)}")
-    # zᵀMz ≤ outer means z_i² ≤ outer (M⁻¹)_ii
-    used = max(row[i] for i, row in enumerate(_inverse(quadratic))) * Fraction(certificate.outer)
-    return int(np.ceil(np.log2(float(max(farthest, used)) * 1.001)))
+    return int(np.ceil(np.log2(float(max(farthest, 1)) * 1.001)))
 
 
 def _quadratic(certificate: PlanarBound) -> list[list[Fraction]]:
@@ -131,12 +130,17 @@ def _quadratic(certificate: PlanarBound) -> list[list[Fraction]]:
     return out
 
 
-def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
-    """Upper bounds of the quadratic part of V in the goal, if it is convex, and of the rest of V there."""
-    inverse, quadratic = _inverse([[Fraction(each) for each in row] for row in certificate.t]), _quadratic(certificate)
+def _corners(certificate: PlanarBound) -> list[list[Fraction]]:
+    """z in the corners of the goal, which is slightly enlarged."""
+    inverse = _inverse([[Fraction(each) for each in row] for row in certificate.t])
     goal = [Fraction(each) * Fraction(1 + 1e-9) for each in Stabilize.AT_REST]
     signs = itertools.product((1, -1), repeat=4)
-    corners = [[sum(row[j] * s[j] * goal[j] for j in range(4)) for row in inverse] for s in signs]
+    return [[sum((row[j] * s[j] * goal[j] for j in range(4)), Fraction(0)) for row in inverse] for s in signs]
+
+
+def _in_goal(certificate: PlanarBound) -> tuple[Fraction, Fraction]:
+    """Upper bounds of the quadratic part of V in the goal, if it is convex, and of the rest of V there."""
+    quadratic, corners = _quadratic(certificate), _corners(certificate)
     # a convex function is largest in a corner
     most = max(sum(z[i] * quadratic[i][j] * z[j] for i in range(4) for j in range(4)) for z in corners)
     largest, rest = [max(corner[i] for corner in corners) for i in range(4)], Fraction(0)
