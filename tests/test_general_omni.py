@@ -8,7 +8,10 @@ import pytest
 
 from ballbot_baselines import LqrController
 from ballbot_baselines.feedback.adaptive import FilteredController
+from ballbot_baselines.feedback.kalman import SensorFilter
 from ballbot_baselines.identification.estimate import Problem
+from ballbot_baselines.identification.likelihood import Innovations
+from ballbot_baselines.identification.record import record
 from ballbot_gym import BallbotEnv, GeneralOmni, Randomization, named_robot, read_urdf
 from ballbot_gym.engines import installed_physics, make_simulator
 from ballbot_gym.env import make_task
@@ -143,7 +146,7 @@ def test_identification_estimates_what_the_usual_robot_does_not_have():
     own = {each.name for each in Problem(ROBOT, names).parameters} - {
         each.name for each in Problem(OMNI, names).parameters
     }
-    assert own == {"com_x", "com_y", "zenith", "axle_friction"}
+    assert own == {"com_x", "com_y", "zenith", "axle_friction", "force drift"}
     moved = replace(ROBOT, com_x=0.02, axle_friction=0.3)
     problem = Problem(ROBOT, names)
     z = problem.z_of(moved, 0.0, np.zeros(len(problem.parameters)))
@@ -197,3 +200,41 @@ def test_forces_that_a_log_took_for_drifts_do_not_hide_the_lean():
         seen, *_, info = env.step(u / known.force_limit)
     assert np.sqrt(np.mean(np.square(errors[25:]))) < 0.001  # rad; 0.005 if speeds drift and forces do not
     np.testing.assert_allclose(info["state"][:2], 0.0, atol=0.03)
+
+
+def test_logs_of_robots_with_dry_friction_have_unknown_forces_of_wheels():
+    robot = replace(SAME, axle_friction=0.2)
+    log = record(robot, 6.0, randomization=None, physics="rk4").readings
+    problem = Problem(robot, log.names)
+    names = [each.name for each in problem.parameters]
+    assert "force drift" not in [each.name for each in Problem(SAME, log.names).parameters]
+    z = np.zeros((2, len(names)))
+    z[0, names.index("force drift")] = -5.0
+    none, forces = Innovations.of(robot, log, problem.lanes(z)).variance[25:].mean(axis=0)
+    assert (forces[6:] > none[6:]).all()  # angles of wheels
+    known = Problem(robot, log.names, tuple(name for name in names if name not in ("axle_friction", "force drift")))
+    found = known.most_likely([log])
+    assert found.robot.axle_friction == pytest.approx(0.2, rel=0.1)  # pyright: ignore[reportAttributeAccessIssue]
+    assert found.estimates[-1].value < 0.5  # N·s in a second: the wheels do what the equations say
+
+
+def test_a_filter_expects_no_less_noise_than_its_sensors_have():
+    task = make_task("stabilize", "omni")
+    usual = SensorFilter(task, SAME).reading_variance
+    log = {"gyro noise": 1e-6, "accel noise": 0.3, "wheel_angle noise": 1e-6}
+    found = SensorFilter(task, SAME, log).reading_variance
+    np.testing.assert_array_equal(found[[0, 1, 2, 6, 7, 8]], usual[[0, 1, 2, 6, 7, 8]])
+    np.testing.assert_allclose(found[3:6], 0.09)
+
+
+def test_a_filter_lets_the_force_of_each_wheel_jump_as_much_as_in_the_log():
+    task, robot = make_task("stabilize", "omni"), replace(SAME, axle_friction=0.1)
+    seen, spreads = BallbotEnv(task, "rk4", robot=robot, observation="sensors").reset(seed=0)[0], []
+    for drift in (0.0, 2.0):
+        log = {"speed drift": 0.0, "lean rate drift": 0.0, "force drift": drift}
+        controller = FilteredController(task, robot, "-ekf", LqrController(task, robot), log)
+        controller.reset(0.0, seen, np.zeros(0))
+        for t in (0.0, 0.02):
+            controller.act(t, seen)
+        spreads.append(controller.filter._p[9, 9])  # pyright: ignore[reportAttributeAccessIssue]
+    assert spreads[1] > 1.5 * spreads[0]

@@ -220,7 +220,7 @@ class SensorFilter:
             params: the robot.
             errors: what `ballbot identify` found of sensors and model, by the names in its numbers.json: "gyro noise",
                 "accel noise", "wheel_angle noise", "accel_x bias", …, "speed drift" and "lean rate drift". Default, and for
-                names that are missing, those of `ballbot_gym.robot.sensors`.
+                names that are missing, those of `ballbot_gym.robot.sensors`, whose noise is the least that is expected.
         """
         self._task, self._params, self._dt = task, params, task.control_dt
         self.model, (self._after, self._over_step) = _robot_and_sensors(params), _control_step(params, task.control_dt)
@@ -253,7 +253,8 @@ class SensorFilter:
         for i, name in enumerate(("gyro", "accel", "wheel_angle")):
             if (noise := errors.get(f"{name} noise")) is not None:
                 # an angle in the control step is the difference of two
-                self.reading_variance[3 * i : 3 * i + 3] = noise**2 * (2 if name == "wheel_angle" else 1)
+                own = noise**2 * (2 if name == "wheel_angle" else 1)
+                self.reading_variance[3 * i : 3 * i + 3] = np.maximum(self.reading_variance[3 * i : 3 * i + 3], own)
         self._bias[3:6] = [errors.get(f"accel_{axis} bias", 0.0) for axis in "xyz"]
         if "speed drift" in errors and "lean rate drift" in errors:
             speeds, rates = (self._dt * errors[f"{name} drift"] ** 2 for name in ("speed", "lean rate"))
@@ -300,9 +301,10 @@ class _DisturbanceFilter(SensorFilter):
     would explain every lean, and so hide a bias. The biases are those of the accelerometer across the body's axis. They
     include errors of where the centre of mass is, because the motion alone shows how far a centre of mass leans.
 
-    `ballbot identify` estimates no such forces, so what they do to speeds and lean rates is in the drifts that it finds. Here
-    these drifts and the dry friction say how large the forces are, and there is no other drift: the accelerometer feels a
-    force, but it would not feel a drift, and the filter would not believe it.
+    `ballbot identify` estimates no forces that last, so what they do to speeds and lean rates is in the drifts that it finds.
+    Here these drifts and the dry friction say how large the forces are, and there is no other drift of these speeds: the
+    accelerometer feels a force, but it would not feel a drift, and the filter would not believe it. What jumps from step to
+    step, such as the resistance of rollers that meet the ball one by one, is the "force drift" of the log.
     """
 
     def __init__(self, task: Task, params: Robot, errors: Mapping[str, float] | None = None):
@@ -313,6 +315,7 @@ class _DisturbanceFilter(SensorFilter):
             robot: Any = params
             friction = _FAST * robot.axle_drag(_FAST)  # no model says in which direction it holds a wheel at rest
             self._force = self._drifting(errors["speed drift"], errors["lean rate drift"]) + friction**2
+        self._gust = errors.get("force drift", 0.0) ** 2 / task.control_dt
         identified = {"accel_x bias", "accel_y bias"} <= set(errors)
         self._of_bias = (_LEFT if identified else _ACCELEROMETER_BIAS) ** 2
 
@@ -333,6 +336,7 @@ class _DisturbanceFilter(SensorFilter):
         moves[:11, :11], moves[:11, 16:] = slopes[:, :11], slopes[:, 11:]
         self._z[:11], self._z[16:] = after[:, 0], lasts * self._z[16:]
         self._p = moves @ self._p @ moves.T
+        self._p[:11, :11] += self._gust * slopes[:, 11:] @ slopes[:, 11:].T
         self._p += np.diag([*self.model_variance, 0.0, 0.0, *[(1 - lasts**2) * self._force] * 3])
         self.disturbance = self._z[16:].copy()
 

@@ -82,7 +82,8 @@ def _misfits(problem: Problem, part: Readings, factors: np.ndarray, looser: floa
     (B, m + k), and the nominal robot drifts more than estimates start from.
     """
     lanes = problem.lanes(np.zeros((len(factors), len(problem.parameters))))
-    lanes = lanes._replace(noise=_LOUDER * lanes.noise, drift=looser * lanes.drift)
+    # with unknown forces a filter would not care about commands
+    lanes = lanes._replace(noise=_LOUDER * lanes.noise, drift=lanes.drift * [looser, looser, 0.0])
     with np.errstate(all="ignore"):  # of filters that fail
         found = Innovations.of(problem.robot, part, lanes, factors)
         fails = ~(np.isfinite(found.missed) & (found.variance > 0) & (found.variance < np.inf))

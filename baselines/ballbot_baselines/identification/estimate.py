@@ -56,6 +56,7 @@ _NOISES = {
 }  # fmt: skip
 """Standard deviation of a reading's noise, SI units, at the start of the estimate."""
 _DRIFTS = {"speed drift": 0.05, "lean rate drift": 0.05}  # m/s and rad/s in a second
+_FORCE_DRIFT = {"force drift": 2.0}  # N·s in a second, of each wheel
 _LEAST_DRIFT = 1e-3  # the same: no robot follows equations better
 _NOISE_SPREAD = 2.0  # of the logarithm of noises and drifts: next to nothing is known before
 _OUTLIER = 5.0  # deviations: one in two million readings is this far by chance
@@ -156,7 +157,8 @@ class Problem:
             _Parameter(f"{name} noise", "", _NOISES[name], _NOISE_SPREAD, positive=True)
             for name in dict.fromkeys(map(Readings.group_of, self.names))
         ]
-        drifts = [_Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in _DRIFTS.items()]
+        every = _DRIFTS | (_FORCE_DRIFT if getattr(self.robot, "axle_friction", 0.0) > 0 else {})
+        drifts = [_Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in every.items()]
         return [each for each in [*robot, *drive, *biases, *noises, *drifts] if each.nominal > 0 or not each.positive]
 
     @property
@@ -203,7 +205,9 @@ class Problem:
             values["lag"],
             np.stack([values.get(f"{name} bias", none) for name in self.names], axis=1),
             np.stack([values[f"{Readings.group_of(name)} noise"] for name in self.names], axis=1),
-            np.stack([np.hypot(values[name], _LEAST_DRIFT) for name in _DRIFTS], axis=1),
+            np.stack(
+                [np.hypot(values[name], _LEAST_DRIFT) for name in _DRIFTS] + [values.get("force drift", none)], axis=1
+            ),
         )
 
     def information(self, logs: list[Readings], z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ A *lane* is one set of numbers for robot, drive and sensors. All lanes are compu
 is installed.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -149,7 +150,8 @@ class Lanes(NamedTuple):
     noise: np.ndarray
     """(B, m) standard deviation of the readings' noise."""
     drift: np.ndarray
-    """(B, 2) standard deviation of what is added to speeds and to turning rates in a second, m/s and rad/s."""
+    """(B, 3) standard deviation of what is added to speeds, to turning rates and to the impulse of each wheel in a second,
+    m/s, rad/s and N·s."""
 
     @staticmethod
     def numbers_of(robot: Ballbot) -> list[float]:
@@ -240,7 +242,7 @@ class Innovations(NamedTuple):
         delays, windows = readings.delays or (0.0,) * m, readings.windows or (0.0,) * m
         times = tuple(zip(delays, windows, strict=True))
         step, size = _step(robot.kind, readings.names, times, robot.substeps(readings.dt))
-        packed = size + size * (size + 1) // 2
+        packed = 2 * size + size * (size + 1) // 2
         calls = -(-lane_count // LANES)
         count = calls * LANES
         factors = np.ones((lane_count, m + readings.commands.shape[1])) if factors is None else factors
@@ -261,7 +263,7 @@ class Innovations(NamedTuple):
             ],
             axis=-1,
         )
-        constants = np.zeros((count, lanes.numbers.shape[1] + 2 * m + 2))
+        constants = np.zeros((count, lanes.numbers.shape[1] + 2 * m + 3))
         constants[:lane_count] = np.hstack([lanes.numbers, lanes.bias, lanes.noise**2, lanes.drift**2])
         constants[lane_count:], steps[:, lane_count:] = constants[:1], steps[:, :1]  # what fills the last call
         now, found = np.zeros_like(steps[0]), np.zeros((count, 2 * m + size))
@@ -279,7 +281,7 @@ class Innovations(NamedTuple):
 
 
 def _starts(readings: Readings, i: int, y: np.ndarray, size: int, count: int) -> np.ndarray:
-    """(count, ...) states and packed covariances of filters that begin at index i, of a log with y (n, B, m)."""
+    """(count, ...) what filters hold that begin at index i, of a log with y (n, B, m); see `_step`."""
     x, spread = np.zeros((count, size)), np.full(size, 0.1)
     spread[: min(size, len(_START))] = _START[:size]
     places = _places(readings.names, size)
@@ -288,7 +290,7 @@ def _starts(readings: Readings, i: int, y: np.ndarray, size: int, count: int) ->
         if name in places and np.isfinite(readings.y[later, j]):
             x[: y.shape[1], places[name]], x[y.shape[1] :, places[name]] = y[later, :, j], y[later, 0, j]
     upper = np.diag(spread**2)[np.triu_indices(size)]
-    return np.hstack([x, np.broadcast_to(upper, (count, len(upper)))])
+    return np.hstack([x, np.broadcast_to(upper, (count, len(upper))), x])
 
 
 def _places(names: tuple[str, ...], size: int) -> dict[str, int]:
@@ -327,35 +329,48 @@ def _step(
 ) -> tuple[casadi.Function, int]:
     """A step of `LANES` filters, and the size of their state.
 
-    (state and packed covariance before the readings; constants; readings, forces before and after, the variance of the
-    latter, and the time until the next readings, s) -> (state and packed covariance before the next readings; innovations,
-    their variances, and the state)
+    (state and packed covariance before the readings, and the state at the readings before; constants; readings, forces before
+    and after, the variance of the latter, and the time until the next readings, s) -> (state and packed covariance before the
+    next readings, and the state; innovations, their variances, and the state)
+
+    Dry friction stops a wheel within milliseconds. Backwards in time, that grows without bounds. So for robots with dry
+    friction, readings of the past are about states between the last two, and covariances follow the steps of the states.
     """
     symbol, robot = casadi.SX.sym, kind.robot
     states, actions, m = len(robot.STATE), len(robot.ACTION), len(names)
     size, count = states + len(_angles(names)), len(kind.numbers) + len(robot.SENSORS)
-    held, constants = symbol("held", size + size * (size + 1) // 2), symbol("constants", count + 2 * m + 2)
+    held, constants = symbol("held", 2 * size + size * (size + 1) // 2), symbol("constants", count + 2 * m + 3)
     step = symbol("step", 2 * m + 3 * actions + 1)
-    numbers, bias, variance, drift = _split(constants, count, m, m, 2)
+    numbers, bias, variance, drift = _split(constants, count, m, m, 3)
     y, used, before, u, uncertain, dt = _split(step, m, m, actions, actions, actions, 1)
     model = Kind(robot, (*kind.numbers, *robot.SENSORS)).model(numbers)
     rates, x = _rates_with_angles(model, names), held[:size]
-    read_at = cache(lambda ago: _expected_readings(model, names, _tuple(_ago(rates, x, before, ago)), before))
-    expected = casadi.vertcat(*[read_at(delay)[i] for i, (delay, _) in enumerate(times)])
+    stiff = hasattr(model, "axle_friction")
+    past = _between(rates, x, held[-size:], before, dt[0]) if stiff else lambda ago: _ago(rates, x, before, ago)
+    read_at = cache(lambda ago: _expected_readings(model, names, _tuple(past(ago)), before))
     means = casadi.vertcat(*[_mean(read_at, i, *each) for i, each in enumerate(times)])
+    if stiff:
+        slopes = _slopes_at(model, names, before, [past(delay) for delay, _ in times])
+    else:
+        slopes = casadi.jacobian(casadi.vertcat(*[read_at(delay)[i] for i, (delay, _) in enumerate(times)]), x)
     z, p, missed, expected_variance = _corrected(
-        x, _unpacked(held[size:], size), (means, casadi.jacobian(expected, x)), (y, used, bias, variance)
+        x, _unpacked(held[size:-size], size), (means, slopes), (y, used, bias, variance)
     )
     at = symbol("x, u", size + actions)
     slopes = casadi.jacobian(casadi.vertcat(*rates(_tuple(at[:size]), _tuple(at[size:]))), at)
     slopes = dt[0] * casadi.substitute(slopes, at, casadi.vertcat(z, *u))
     moved, by_force = slopes[:, :size], slopes[:, size:]
-    transition = casadi.SX.eye(size) + moved + moved @ moved / 2
+    halvings = math.ceil(math.log2(substeps)) if stiff else 0
+    part = moved / 2**halvings
+    transition = casadi.SX.eye(size) + part + part @ part / 2
+    for _ in range(halvings):
+        transition = transition @ transition
     speeds = [0.0 if i in _POSES or i >= states else drift[0] if i in (4, 5) else drift[1] for i in range(size)]
     p = transition @ p @ transition.T + dt[0] * casadi.diag(casadi.vertcat(*speeds))
-    p = p + by_force @ casadi.diag(casadi.vertcat(*uncertain)) @ by_force.T
+    unknown = casadi.vertcat(*uncertain) + drift[2] / dt[0]
+    p = p + by_force @ casadi.diag(unknown) @ by_force.T
     after = model.step(_tuple(z), u, dt[0], substeps, rates)
-    packed = casadi.vertcat(*after, *(p[i, j] for i in range(size) for j in range(i, size)))
+    packed = casadi.vertcat(*after, *(p[i, j] for i in range(size) for j in range(i, size)), z)
     outputs = [packed, casadi.vertcat(*missed, *expected_variance, z)]
     function = casadi.Function(
         "filter", [held, constants, step], [casadi.densify(each) for each in outputs], {"cse": True}
@@ -370,6 +385,29 @@ def _ago(rates: Callable[[Any, Any], tuple[Any, ...]], x: Any, u: tuple[Any, ...
         return x
     middle = x - ago / 2 * casadi.vertcat(*rates(_tuple(x), u))
     return x - ago * casadi.vertcat(*rates(_tuple(middle), u))
+
+
+def _between(rates: Callable[[Any, Any], tuple[Any, ...]], x: Any, last: Any, u: tuple[Any, ...], dt: Any) -> Callable:
+    """How x (n,) was some time ago, s, if it was `last` (n,) before dt: a cubic between both, or earlier a line."""
+    now, then = (casadi.vertcat(*rates(_tuple(each), u)) for each in (x, last))
+
+    def past(ago: float) -> Any:
+        share = 1 - casadi.fmin(ago / dt, 1)
+        of_x, of_last = share**2 * (3 - 2 * share), (1 - share) ** 2 * (1 + 2 * share)
+        of_now, of_then = -(share**2) * (1 - share), share * (1 - share) ** 2
+        earlier = casadi.fmax(ago - dt, 0)
+        return of_x * x + of_last * last + dt * (of_now * now + of_then * then) - earlier * then
+
+    return past
+
+
+def _slopes_at(robot: Any, names: tuple[str, ...], u: tuple[Any, ...], states: list[Any]) -> Any:
+    """(m, n) how each reading changes with the state, at the state (n,) that it is about."""
+    at, rows = casadi.SX.sym("at", states[0].shape[0]), []
+    slopes = casadi.jacobian(casadi.vertcat(*_expected_readings(robot, names, _tuple(at), u)), at)
+    for i, state in enumerate(states):
+        rows.append(casadi.substitute(slopes[i, :], at, state))
+    return casadi.vertcat(*rows)
 
 
 def _mean(read_at: Callable[[float], list[Any]], i: int, delay: float, window: float) -> Any:
