@@ -392,9 +392,7 @@ def _between(rates: Callable[[Any, Any], tuple[Any, ...]], x: Any, last: Any, u:
     now, then = (casadi.vertcat(*rates(_tuple(each), u)) for each in (x, last))
 
     def past(ago: float) -> Any:
-        share = 1 - casadi.fmin(ago / dt, 1)
-        of_x, of_last = share**2 * (3 - 2 * share), (1 - share) ** 2 * (1 + 2 * share)
-        of_now, of_then = -(share**2) * (1 - share), share * (1 - share) ** 2
+        of_last, of_then, of_x, of_now = hermite_basis(1 - casadi.fmin(ago / dt, 1))
         earlier = casadi.fmax(ago - dt, 0)
         return of_x * x + of_last * last + dt * (of_now * now + of_then * then) - earlier * then
 
