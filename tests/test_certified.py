@@ -210,7 +210,7 @@ def test_the_version_of_the_benchmark_is_raised_when_episodes_costs_observations
         known = certified.load(kind.id, PAPER)
         numbers = [*known.states.ravel(), *known.constants.ravel(), *known.costs]
         parts.append([problem_digest(make_task(kind.id, PAPER), robot), [f"{value:.9g}" for value in numbers]])
-    assert (version.BENCHMARK, digest(parts)) == ("1", "f6b8cb955e108481e4eb81d4")
+    assert (version.BENCHMARK, digest(parts)) == ("2", "3156b23f6850facd7c641c64")
 
 
 def test_what_is_of_another_version_of_the_benchmark_is_refused(tmp_path, monkeypatch):
@@ -219,10 +219,10 @@ def test_what_is_of_another_version_of_the_benchmark_is_refused(tmp_path, monkey
     assert certified.load("stabilize", PAPER, path).costs[0] == known.costs[0]
     result = Result("stabilize", "lqr", 0, "rk4", 1.0, 1.0, True, False)
     write_results(leaderboard([result]), [result], {}, tmp_path)
-    assert read_results(tmp_path)[0]["benchmark"] == "1"
-    assert {entry.benchmark for entry in read_entries()} == {"1"}
-    monkeypatch.setattr(version, "BENCHMARK", "2")
+    assert read_results(tmp_path)[0]["benchmark"] == "2"
+    assert {entry.benchmark for entry in read_entries()} == {"2"}
+    monkeypatch.setattr(version, "BENCHMARK", "3")
     certified.load.__globals__["_read"].cache_clear()
     for read in (lambda: certified.load("stabilize", PAPER, path), lambda: read_results(tmp_path), read_entries):
-        with pytest.raises(ValueError, match="is of version '1' of the benchmark, and this is version 2"):
+        with pytest.raises(ValueError, match="is of version '2' of the benchmark, and this is version 3"):
             read()

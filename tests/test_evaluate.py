@@ -108,7 +108,7 @@ def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
     assert float(table[0]["regret_mean"]) == pytest.approx(0.2)
     document = json.loads((tmp_path / "leaderboard.json").read_text())
     assert document["rows"][1]["settle_time_median"] is None  # NaN is no JSON
-    assert document["about"] == {"benchmark": "1", "commit": "none"}
+    assert document["about"] == {"benchmark": "2", "commit": "none"}
 
 
 @pytest.mark.parametrize("name", ["", "leaderboard.json"])
@@ -117,7 +117,7 @@ def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
     write_results(leaderboard(results), results, {"commit": "none"}, tmp_path)
     about, read = read_results(tmp_path / name)
     assert repr(read) == repr(results)  # NaN is not equal to itself
-    assert about == {"benchmark": "1", "commit": "none"}
+    assert about == {"benchmark": "2", "commit": "none"}
 
 
 @pytest.mark.parametrize(

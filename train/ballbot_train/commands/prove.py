@@ -13,7 +13,7 @@ from ballbot_train.work.console import check_least, check_names, console, progre
 
 _STORED = 20  # episodes of a set whose forces come with the package
 _STATEMENT = """\
-Proven for 799 of the 800 certified optima of the paper's robot: near it is a strict local minimum of the episode as the
+Proven for all 800 certified optima of the paper's robot: near it is a strict local minimum of the episode as the
 environment computes it, with RK4 steps, held forces, bounds of forces, tilt, arena and obstacles, and the goal. Interval
 arithmetic encloses the minimum and its cost. The theorem is at the top of ballbot_baselines/proofs/local_minimum.py.
 --planar proves a lower bound of the cost of every successful planar episode of Stabilize that starts near rest.
