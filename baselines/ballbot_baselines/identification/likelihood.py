@@ -401,11 +401,9 @@ def _between(rates: Callable[[Any, Any], tuple[Any, ...]], x: Any, last: Any, u:
 
 def _slopes_at(robot: Any, names: tuple[str, ...], u: tuple[Any, ...], states: list[Any]) -> Any:
     """(m, n) how each reading changes with the state, at the state (n,) that it is about."""
-    at, rows = casadi.SX.sym("at", states[0].shape[0]), []
+    at = casadi.SX.sym("at", states[0].shape[0])
     slopes = casadi.jacobian(casadi.vertcat(*_expected_readings(robot, names, _tuple(at), u)), at)
-    for i, state in enumerate(states):
-        rows.append(casadi.substitute(slopes[i, :], at, state))
-    return casadi.vertcat(*rows)
+    return casadi.vertcat(*[casadi.substitute(slopes[i, :], at, state) for i, state in enumerate(states)])
 
 
 def _mean(read_at: Callable[[float], list[Any]], i: int, delay: float, window: float) -> Any:
