@@ -157,7 +157,7 @@ class Problem:
             _Parameter(f"{name} noise", "", _NOISES[name], _NOISE_SPREAD, positive=True)
             for name in dict.fromkeys(map(Readings.group_of, self.names))
         ]
-        every = _DRIFTS | (_FORCE_DRIFT if getattr(self.robot, "axle_friction", 0.0) > 0 else {})
+        every = _DRIFTS | (_FORCE_DRIFT if self.robot.without_dry_friction() != self.robot else {})
         drifts = [_Parameter(name, "", nominal, _NOISE_SPREAD, positive=True) for name, nominal in every.items()]
         return [each for each in [*robot, *drive, *biases, *noises, *drifts] if each.nominal > 0 or not each.positive]
 
