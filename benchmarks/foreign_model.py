@@ -6,14 +6,19 @@ LQR with the numbers of the file records a log of 60 s, as docs/identify.md says
 alone. A controller with that robot, behind the filter with these errors, then drives from random leans, speeds and places for
 8 s. The sensors have the noise of those of `omni`, in the log too. The motors may give less torque than in the file: then the
 robot that was identified has the same share of its force. Episodes that are in the file of results are not repeated.
+
+The controller `policy` is trained by DAgger for each of the leans, on starts like those that it drives from. Its optima are
+those of the robot without dry friction, and it overcomes this friction as LQR does. Policies in the folder of a log are used
+again.
 """
 
 import argparse
 import csv
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +29,12 @@ from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.identification.identify import identify
 from ballbot_baselines.identification.likelihood import Readings
 from ballbot_baselines.identification.logs import Log
-from ballbot_gym import MujocoModel, files, urdf_text
+from ballbot_gym import MujocoModel, files, named_robot, register_robot, urdf_text
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Sensors, read_urdf, tilt
 from ballbot_gym.rollout import Controller, PlanError
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy.network import PolicyController, PolicyNetwork
 
 _KNOWN = (
     "body_mass", "ball_mass", "com_height", "inertia", "axial_inertia", "zenith", "force_limit", "wheels.no_load_speed",
@@ -59,11 +66,38 @@ class FullTorque(LqrController):
         return robot.force_limit * np.sign(robot.turning_ball(x, 1e6 * falling))  # pyright: ignore
 
 
+class TrainedPolicy:
+    """A policy for a robot, which is trained if its file does not exist. It overcomes dry friction as LQR does."""
+
+    def __init__(self, task: Any, robot: Any, file: Path):
+        self._task, self._robot = task, robot
+        urdf, name = file.with_suffix(".urdf"), re.sub(r"\W", "_", f"{file.parent.name}_{file.stem}").lower()
+        if not urdf.exists():
+            files.write(urdf, urdf_text(robot.without_dry_friction()))
+        register_robot(name, urdf)
+        smooth = named_robot(name)
+        if not file.exists():
+            given = {"iterations": 8, "gathering_iterations": 2, "episodes_per_iteration": 8, "symmetry": "none"}
+            settings = replace(LEARNERS["dagger"].settings("stabilize"), **given)
+            learner = LEARNERS["dagger"].make(task, smooth, settings, 0)
+            while learner.iteration < learner.iterations:
+                learner.iterate()
+            learner.network.save(file, {"training": {"learner": "dagger", "settings": asdict(settings)}})
+        self._policy = PolicyController(task, smooth, PolicyNetwork.load(file, task, name))
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._policy.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        return self._robot.overcoming(x, self._policy.act(t, x), self._task.control_dt)
+
+
 _CONTROLLERS: dict[str, Callable[[Any, Any], Controller]] = {
     "lqr": LqrController,
     "nmpc": NmpcController,
     "full": FullTorque,
 }
+_POLICY = "policy"
 
 
 def main() -> None:
@@ -71,7 +105,7 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("--hold", nargs="*", default=[], metavar="JOINT=RAD", help="where joints are held")
     parser.add_argument("--logs", nargs="+", choices=_LOGS, default=list(_LOGS))
-    parser.add_argument("--controllers", nargs="+", choices=_CONTROLLERS, default=["lqr"])
+    parser.add_argument("--controllers", nargs="+", choices=[*_CONTROLLERS, _POLICY], default=["lqr"])
     parser.add_argument("--leans", nargs="+", type=float, default=[5.0, 11.0, 17.0], help="degrees, for each axis")
     parser.add_argument("--torques", nargs="+", type=float, default=[2.0, 2.0, 4.0], help="N m, for each of the leans")
     parser.add_argument("--seeds", type=int, default=10)
@@ -113,6 +147,8 @@ class Identified:
 
     robot: Any
     errors: dict[str, float]
+    folder: Path
+    """With what the log gave, and policies for the robot."""
 
     @classmethod
     def of(cls, model: MujocoModel, start: str, folder: Path) -> "Identified":
@@ -128,7 +164,7 @@ class Identified:
             files.write(numbers, json.dumps(found, indent=1))
         found = json.loads(numbers.read_text())
         print(f"{folder.name}: " + ", ".join(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
-        return cls(read_urdf(robot), found)
+        return cls(read_urdf(robot), found, folder)
 
 
 class Sensed:
@@ -190,7 +226,12 @@ def driven(model: MujocoModel, found: Identified, key: dict[str, str]) -> dict[s
     task = replace(
         make_task("stabilize", "omni"), start_position=_PLACE, start_speed=_SPEED, start_lean=lean, start_lean_rate=1e-3
     )
-    controller, senses = _CONTROLLERS[key["controller"]](task, robot), key["sees"] == "sensors"
+    senses = key["sees"] == "sensors"
+    if key["controller"] == _POLICY:
+        file = found.folder / f"policy_{float(key['lean']):g}_{float(key['torque']):g}.json"
+        controller: Controller = TrainedPolicy(task, robot, file)
+    else:
+        controller = _CONTROLLERS[key["controller"]](task, robot)
     if senses:
         controller = FilteredController(task, robot, "-ekf", controller, found.errors)
     x = np.zeros(11)
