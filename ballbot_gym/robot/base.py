@@ -242,15 +242,22 @@ class Robot(ABC):
     @property
     def kind(self) -> Kind:
         """What compiled functions are made for; `numbers` are their parameters."""
-        return Kind(type(self), self.number_names())
+        return Kind(type(self), self._ordered_names())
 
     def number_names(self) -> tuple[str, ...]:
         """Names of the attributes that the equations of motion and limits read; "a.b" is attribute b of attribute a."""
         return tuple(field.name for field in fields(self))  # pyright: ignore[reportArgumentType]
 
+    def _ordered_names(self) -> tuple[str, ...]:
+        """`number_names` with friction last: robots with it and without have the other numbers in the same places.
+
+        So they share their compiled equations of motion.
+        """
+        return tuple(sorted(self.number_names(), key="friction".__eq__))
+
     def numbers(self) -> list[Any]:
-        """The values of `number_names`."""
-        return [attrgetter(name)(self) for name in self.number_names()]
+        """The values of `kind.numbers`."""
+        return [attrgetter(name)(self) for name in self._ordered_names()]
 
     def step(
         self,
