@@ -51,7 +51,7 @@ def largest_leans(task: Task, params: Robot, component: int, values: np.ndarray)
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
     middle = int(np.argmin(np.abs(values)))
-    standing = np.zeros((task.steps + 1, 9)), np.zeros((task.steps, 2))
+    standing = np.zeros((task.steps + 1, 8)), np.zeros((task.steps, 2))
     sideways = _sideways(task, params) or standing
     for order in (range(middle, len(values)), range(middle, -1, -1)):
         start, failures = standing, 0
@@ -74,7 +74,7 @@ def _solve(solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, valu
     lower, upper = solver.ocp.no_bounds(len(a))
     known = [i for i in range(8) if i != _LEAN]
     lower[0, known] = upper[0, known] = np.where(np.array(known) == component, value, 0.0)
-    lower[:, x.shape[1] :], upper[:, x.shape[1] :] = -1.0, 1.0
+    lower[:, 8:], upper[:, 8:] = -1.0, 1.0
     return solver.solve(x, a, lower, upper, p)
 
 
@@ -84,27 +84,26 @@ def _sideways(task: Task, params: Robot) -> tuple[np.ndarray, np.ndarray] | None
     x0[_LEAN] = _STEEP
     for member in righting.righted(task, params, x0, np.zeros(0), params.force_limit):
         if member.side and len(member.u) == task.steps:
-            return np.column_stack([member.x, np.full(len(member.x), _STEEP)]), member.u / params.force_limit
+            return member.x, member.u / params.force_limit
     return None
 
 
 def _largest_lean_ocp(task: Task, params: Robot) -> Ocp:
-    """The task's problem with a free initial lean. The ninth state carries that lean to the end, where it is the reward."""
+    """The task's problem with a free initial lean, which the first stage rewards."""
     check_formulas(task, params)
     fixed = ocp_of(task, params.kind)
     price = _REGULARIZATION * task.control_dt
-    same = np.zeros((1, 9))
-    same[0, _LEAN], same[0, 8] = 1.0, -1.0
+
+    def cost(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        regular = casadi.sumsqr(a) + casadi.sumsqr(s[2:4]) + 0.1 * casadi.sumsqr(s[6:8])
+        return price * regular - casadi.if_else(p[-1] == 0, s[_LEAN], 0)  # the number of the stage is last in p
+
     return replace(
         fixed,
         name=f"{task.id}-recovery",
-        states=9,
-        next=lambda s, a, p: casadi.vertcat(fixed.next(s[:8], a, p), s[8]),
-        cost=lambda s, a, p: price * (casadi.sumsqr(a) + casadi.sumsqr(s[2:4]) + 0.1 * casadi.sumsqr(s[6:8])),
-        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
-        final_cost=lambda s, p: -s[8],
+        cost=cost,
         final_inequalities=lambda s, p: casadi.vertcat(
-            fixed.final_inequalities(s[:8], p), *(-excess for excess in task.goal(s[:8], p[:0]))
+            fixed.final_inequalities(s, p), *(-excess for excess in task.goal(s, p[:0]))
         ),
-        initial_matrix=same,
+        counts_stages=True,
     )
