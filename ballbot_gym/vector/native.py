@@ -22,7 +22,11 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_digest
 from ballbot_gym.vector.arrays import FLAG_ROWS, BallbotArrays, Computed, State
 
-_COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
+# With GCC, -O3 takes half as much time again, and steps of large batches of robots without wheels take 6 to 8 % longer.
+_COMPILER_FLAGS = (
+    *("-O2", "-ftree-vectorize"),
+    *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd"),
+)
 _PARALLEL_FROM = 4096
 """Smallest number of envs whose steps several threads share. Two threads take as long as one for 2,048 envs, and a seventh
 less for 4,096."""
