@@ -1,6 +1,7 @@
 """Fixtures that parametrize tests over everything registered, so that a new task arrives tested."""
 
 import functools
+import gc
 import itertools
 import os
 import sys
@@ -19,6 +20,11 @@ from ballbot_gym.robot import ROBOTS, default_params
 from ballbot_gym.tasks import TASKS
 
 _NUMBERS = itertools.count()
+
+
+def pytest_collection_finish():
+    """What is imported stays, so the garbage collector needs not look at it again: that took 4 % of the tests' time."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -254,7 +254,7 @@ def test_short_episodes_do_not_count_what_comes_after(params, duration):
 
 
 def test_without_a_compiler_they_are_found_one_by_one(monkeypatch, params, interpreted):
-    task, x0 = Stabilize(max_tilt=1.3, duration=1.0), np.array([[0.1] + [0.0] * 7, FALLEN])
+    task, x0 = Stabilize(max_tilt=1.3, duration=0.5), np.array([[0.1] + [0.0] * 7, FALLEN])
 
     def missing(*arguments):
         raise machine_code.NoMachineCodeError
@@ -306,9 +306,10 @@ def test_threads_do_not_disturb_each_other(optima, params):
 
 def test_diverging_iterations_warn_of_nothing(params):
     """A robot that falls overflows whatever simulates it, and that is no news to the user."""
+    task = Stabilize(duration=1.0)
     x0 = np.array([FALLEN, [0, 0, 1.2, 1.2, 40.0, -40.0, 9.0, 9.0], [9, -9, 0.6, -0.6, 60.0, 60.0, 3.0, -3.0]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        find_optima(Stabilize(), params, x0, np.zeros((3, 0)))
+        find_optima(task, params, x0, np.zeros((3, 0)))
         with contextlib.suppress(PlanError):
-            find_optimum(Stabilize(), params, x0[0], NO_CONSTANTS, twice=True)
+            find_optimum(task, params, x0[0], NO_CONSTANTS, twice=True)

@@ -504,7 +504,7 @@ def test_the_regret_of_the_controller_is_that_of_parts_of_a_log_that_end_at_rest
     assert _scores(found, driven.readings) == []
 
 
-def test_the_regret_of_a_drive_does_not_depend_on_the_heading_that_the_robot_keeps(interpreted) -> None:
+def test_the_regret_of_a_drive_does_not_depend_on_the_heading_that_the_robot_keeps(interpreted: None) -> None:
     def motion(t: float) -> np.ndarray:
         return np.array([0.4 * (t >= 3.0), 0.0, 0.4])
 
