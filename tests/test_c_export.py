@@ -205,12 +205,20 @@ def test_a_state_that_is_no_number_gives_no_force_and_a_flag(bad, flags, tmp_pat
     assert acts(good) == first  # its history is forgotten
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
-def test_a_filter_starts_anew_after_a_reading_that_is_no_number(bad, tmp_path):
-    export("lqr-ekf", task="stabilize", format="c", out=tmp_path / "filtered.c", robot="omni")
-    code = ctypes.CDLL(str(built(tmp_path / "filtered.c", tmp_path / "filtered.so", "-fPIC", "-shared")))
+@pytest.fixture(scope="module")
+def filtered(tmp_path_factory):
+    """The library of LQR behind a filter, for the robot with wheels."""
+    folder = tmp_path_factory.mktemp("filtered")
+    export("lqr-ekf", task="stabilize", format="c", out=folder / "filtered.c", robot="omni")
+    code = ctypes.CDLL(str(built(folder / "filtered.c", folder / "filtered.so", "-fPIC", "-shared")))
     pointer = np.ctypeslib.ndpointer(np.float32)
     code.ballbot_first_estimate.argtypes = code.ballbot_estimate.argtypes = (pointer,) * 3
+    return code
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_a_filter_starts_anew_after_a_reading_that_is_no_number(bad, filtered):
+    code = filtered
     state, place, action = np.zeros(11, np.float32), np.array([0.5, -0.2], np.float32), np.full(3, 0.1, np.float32)
     sensors = np.array([0.01, 0.02, 0.0, 0.1, 0.2, 9.8, 0.0, 0.0, 0.0], np.float32)
     code.ballbot_first_estimate(sensors, place, state)
