@@ -12,10 +12,9 @@ from ballbot_gym import certified
 from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_gym.vector.arrays import BallbotArrays
 
 torch = pytest.importorskip("torch")
-
-from ballbot_gym.vector.batch import BallbotBatch  # noqa: E402
 
 ENVS = 32
 """Of each policy."""
@@ -63,26 +62,27 @@ def play(task):
     """`Played` by name of policy. All policies act in one batch."""
     params = default_params()
     chosen, rng = policies(task, params), np.random.default_rng(0)
-    batch = BallbotBatch(task, ENVS * len(chosen), dtype=torch.float64, compile=False)
+    envs = BallbotArrays(task, ENVS * len(chosen), np.float64, params)
     parts = [slice(i * ENVS, (i + 1) * ENVS) for i in range(len(chosen))]
-    observation = batch.reset(seed=0)
-    running, steps = torch.ones(batch.num_envs, dtype=torch.bool), []
-    with torch.no_grad():
-        for _ in range(task.steps):
-            before = batch.state
-            actions = [
-                policy(before.x[:, part], observation[part], rng)
-                for policy, part in zip(chosen.values(), parts, strict=True)
-            ]
-            result = batch.step(torch.cat(actions))
-            rate = task.cost(before.x.unbind(0), result.force.unbind(0), before.c.unbind(0))
-            gain = (task.survival_reward - rate) * task.control_dt
-            figures = torch.stack([gain, result.reward, result.failure, result.violated])
-            steps.append(torch.where(running, figures, math.nan))
-            running = running & ~(result.terminated | result.truncated)
-            observation = result.observation
+    envs.state = envs.initial_state(seed=0)
+    observation = envs.observe(envs.state)
+    running, steps = np.ones(envs.num_envs, bool), []
+    for _ in range(task.steps):
+        x, seen, c = torch.from_numpy(envs.state.x), torch.from_numpy(observation), tuple(envs.state.c)
+        with torch.no_grad():
+            actions = [policy(x[:, part], seen[part], rng) for policy, part in zip(chosen.values(), parts, strict=True)]
+        before = tuple(envs.state.x)
+        observation, reward, terminated, truncated, info = envs.step(torch.cat(actions).double().numpy())
+        ended = terminated | truncated
+        at_end = info.get("final_info", info)  # an env that ends is in its next episode
+        force, failure, violated = (
+            np.where(ended, at_end[name].T, info[name].T) for name in ("force", "failure", "violated")
+        )
+        gain = (task.survival_reward - task.cost(before, tuple(force), c)) * task.control_dt
+        steps.append(np.where(running, [gain, reward, failure, violated], math.nan))
+        running = running & ~ended
     assert not running.any()
-    gains, rewards, failures, violated = torch.stack(steps, 1).numpy()
+    gains, rewards, failures, violated = np.stack(steps, 1)
     return {
         name: Played(
             gains[:, part],
