@@ -74,8 +74,11 @@ def interpreted(monkeypatch):
 
     For a problem that no other test solves, compiling takes longer than solving without machine code.
     """
-    compiled, shooting = (pytest.importorskip(f"ballbot_baselines.solvers.{name}") for name in ("compiled", "shooting"))
+    compiled, nlp, shooting = (
+        pytest.importorskip(f"ballbot_baselines.solvers.{name}") for name in ("compiled", "nlp", "shooting")
+    )
     monkeypatch.setattr(compiled, "_loaded", lambda *_: None)
+    monkeypatch.setattr(nlp, "_dynamics_made", {})
     for name in ("ocp_of", "_solver"):
         monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))
 

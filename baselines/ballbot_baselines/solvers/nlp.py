@@ -119,6 +119,22 @@ class _RatesStage(_Stage):
         self.jacobian_at, self.hessian_at = (casadi.Sparsity.dense(rows, width) for rows in (n, width))
 
 
+_dynamics_made: dict[tuple[str, int], _Stage] = {}
+
+
+def _dynamics(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
+    """The stage of dynamics, shared by problems of the same equations, as those of all tasks of a robot are.
+
+    To differentiate and to print them takes half a second.
+    """
+    used = int(max(np.flatnonzero(casadi.which_depends(move, p, 1)) + 1, default=0))
+    same = casadi.Function("move", [z, p[:used]], [move]).serialize(), steps
+    if same not in _dynamics_made:
+        made = _RatesStage(z, p, move, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
+        _dynamics_made[same] = made
+    return _dynamics_made[same]
+
+
 class Stages:
     """What a program of any horizon is made of; see `ocp.Ocp`.
 
@@ -160,7 +176,7 @@ class Stages:
             casadi.densify(each) for each in (move, casadi.vertcat(*running), casadi.vertcat(*final))
         )
         flags = LONG if steps else SIMD
-        self.dynamics = _RatesStage(z, p, move, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
+        self.dynamics = _dynamics(z, p, move, steps)
         self.running = _Stage(name, z, p, costs, of_stages=True, flags=flags)
         self.final = _Stage(f"{name}-final", s, p, final_costs, of_stages=False)
         self.equalities, self.final_equalities = running[1].shape[0], final[1].shape[0]
