@@ -182,7 +182,7 @@ def test_in_the_browser_the_page_shows_the_stream_and_the_scenarios_and_a_drag_p
 
     browser.get(opened.viewer.address)
     chips = "return [...document.querySelectorAll('.chips button')].map((chip) => chip.textContent)"
-    assert browser.execute_script(chips) == ["Live", "Push", "Throw", "Orbit", "Turn", "Weave"]
+    wait_for(lambda: browser.execute_script(chips) == ["Live", "Push", "Throw", "Orbit", "Turn", "Weave"])
     wait_for(lambda: browser.execute_script("return playground.moment.robots.length") == 1)
     wait_for(lambda: "LQR" in browser.find_element("css selector", ".readouts tbody").text)
     assert browser.find_element("css selector", ".names div").text.startswith("LQR")
