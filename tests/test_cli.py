@@ -55,7 +55,7 @@ def test_optimize_writes_a_trajectory_that_starts_where_it_was_told(tmp_path, ty
 def test_optimize_says_what_is_proven_of_a_planar_start_near_rest(typed):
     ended, printed = typed("optimize", "stabilize", "--state", 0.2, 0, 0.05, 0, 0.1, 0, 0, 0, "--out", "plan")
     assert ended == 0
-    assert "its regret is at most 6.1%" in printed
+    assert "its regret is at most 2.9%" in printed
 
 
 @pytest.mark.parametrize("name", COMMANDS)

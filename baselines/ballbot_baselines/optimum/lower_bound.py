@@ -1,6 +1,7 @@
-"""A lower bound of the cost of planar episodes of Stabilize near rest. `ballbot prove --planar` proves it.
+"""A lower bound of the cost of planar episodes of Stabilize, for two fifths of its planar starts.
 
-The theorem is at the top of `proofs/planar_bound.c`, and its numbers are in `lower_bound.json`.
+`ballbot prove --planar` proves it. The theorem is at the top of `proofs/planar_bound.c`, and its numbers are in
+`lower_bound.json`.
 """
 
 import hashlib
@@ -74,7 +75,7 @@ class PlanarBound:
 
         Returns:
             The bound. NaN where none is proven: for other problems than Stabilize of the paper's robot, for starts that are
-            not near rest, and for those outside of the vertical planes through the x and the y axis.
+            farther from rest, and for those outside of the vertical planes through the x and the y axis.
         """
         given = {name: getattr(task, name, None) for name in _FREE}
         if None in given.values() or replace(Stabilize(), **given) != task or robot != named_robot(PAPER):

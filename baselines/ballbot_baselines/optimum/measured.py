@@ -37,7 +37,7 @@ class Regret:
     | `force_excess` | by how much the largest recorded force exceeds the force limit, N; 0 if none does |
 
     Defects of an optimum are below 1e-6. If they are not small, this robot cannot perform the motion, and the regret has no
-    meaning. `proven` is a number for starts of Stabilize in a vertical plane and near rest: see `PlanarBound`.
+    meaning. `proven` is a number for two fifths of the starts of Stabilize in a vertical plane: see `PlanarBound`.
     """
 
     regret: float

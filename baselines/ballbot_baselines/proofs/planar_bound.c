@@ -324,33 +324,49 @@ static void enclose(const box b[LANES], int moves, motion *m) { /* all but V */
     EACH(i, 4) pair_times(&square, &m->z[i], &m->z[i]), pair_add(&m->q, 1, &square);
 }
 
-/* dt l + V(F) - rho, or rho Q(F) - rho, which says nothing of l, both divided by dt sigma */
-static void beyond(const motion *m, const pair *after, double by, real low, real high, verdict *out) {
+/* of_v (dt l + V(F) - rho) + of_q (Q(F) - 1), divided by dt sigma. Where this is positive, dt l + V(F) > rho or Q(F) > 1 */
+static void beyond(const motion *m, double of_v, double of_q, real low, real high, verdict *out) {
     static _Thread_local model g;
-    /* rho/sigma lies below its chord, by `sag` in the middle */
-    real most = P.rho / P.dt / low, least = P.rho / P.dt / high, sag = 0.5 * (most + least) - P.rho / P.dt / m->sigma.c[0];
-    if (after == &m->v) g = m->cost; else number(&g, 0);
-    add(&g, &g, by, &after->change), add(&g, &g, by / P.dt, &after->at);
+    double least_of = of_v * P.rho + of_q;
+    /* 1/sigma lies below its chord, by `sag` in the middle */
+    real most = least_of / P.dt / low, least = least_of / P.dt / high, sag = 0.5 * (most + least) - least_of / P.dt / m->sigma.c[0];
+    number(&g, 0);
+    if (of_v) add(&g, &m->cost, 1, &m->v.change), add(&g, &g, 1 / P.dt, &m->v.at), scale(&g, of_v);
+    if (of_q) add(&g, &g, of_q, &m->q.change), add(&g, &g, of_q / P.dt, &m->q.at);
     g.c[0] -= 0.5 * (most + least), g.c[1] += 0.5 * (most - least), g.r += 1e-11 * (most + norm(&g, 0)), g.top = ORDER;
     judge(&g, out);
     out->part[0] += sag;
 }
-/* What is known of boxes, and which side to halve: where no model is finite, what makes the lean vary most */
+/* What is known of boxes, and which side to halve: where no model is finite, or the middle leans beyond the limit by
+   more than 0.02 rad, what makes the lean vary most */
 static void choose(const box b[LANES], const verdict *worst, int moves, mask inside, mask done, mask wrong, int *proven, int *refuted,
                    int *axis) {
     EACH(l, LANES) {
-        double largest = -1, width[VARS] = {b[l].half[0] / b[l].mid[0] / 2, 0, 0, 0, b[l].half[4] / 4e4};
+        double largest = -1, lean = row_times_y(&b[l], P.t[1]).low / 2 + row_times_y(&b[l], P.t[1]).high / 2;
+        int vary = !isfinite(worst->low[l]) || lean * lean * b[l].mid[0] > (P.reach[1] + 0.02) * (P.reach[1] + 0.02);
+        double width[VARS] = {b[l].half[0] / b[l].mid[0] / 2, 0, 0, 0, b[l].half[4] / 4e4};
         EACH(i, 4) if (i != b[l].face) {
             int n = 1 + i - (i > b[l].face);
             width[n] = b[l].half[n] * (fabs(P.t[1][i]) + P.dt * fabs(P.t[3][i]) + 1e-3);
         }
         proven[l] = done[l] != 0, refuted[l] = wrong[l] != 0;
         EACH(i, moves ? VARS : 4) {
-            double part = isfinite(worst->low[l]) ? worst->part[i][l] : width[i];
+            double part = vary ? width[i] : worst->part[i][l];
             if (part > largest) largest = part, axis[l] = i;
         }
         double force = b[l].half[4]; /* outside of D little is proven for a wide range of forces */
         if (moves && !inside[l] && force * force * b[l].mid[0] > 4e4) axis[l] = 4;
+        force = row_times_y(&b[l], P.gain).low / 2 + row_times_y(&b[l], P.gain).high / 2 + b[l].mid[4];
+        if (moves && !vary && force * force * b[l].mid[0] > (P.limit + 5) * (P.limit + 5)) {
+            double of_size = fabs(force) * width[0];
+            largest = b[l].half[4], axis[l] = 4;
+            if (of_size > largest) largest = of_size, axis[l] = 0;
+            EACH(i, 4) if (i != b[l].face) {
+                int n = 1 + i - (i > b[l].face);
+                double part = b[l].half[n] * fabs(P.gain[i]);
+                if (part > largest) largest = part, axis[l] = n;
+            }
+        }
     }
 }
 
@@ -374,7 +390,7 @@ static void examine(const box b[LANES], int moves, int *proven, int *refuted, in
     EACH(j, 4) least_force -= fabs(P.gain[j]);
     double force2 = least_force * least_force * (1 - 1e-12);
     mask bounded = (P.rho / low <= P.dt * P.force_cost * force2) | (force2 * low >= P.limit * P.limit);
-    beyond(&m, &m.q, P.rho, low, high, &one);
+    beyond(&m, 0, P.rho, low, high, &one);
     /* far from D, V is a help in small boxes only */
     mask enough = one.low > 0, rough = ~(one.low > -INFINITY);
     rough |= (q_low * low > 1) & (one.middle > 0) & (one.low * low < -0.3 * P.rho / P.dt);
@@ -385,10 +401,13 @@ static void examine(const box b[LANES], int moves, int *proven, int *refuted, in
         return;
     }
     value(&m.sigma, m.z, &m.v), range(&m.v.at, &v_low, &v_high);
-    beyond(&m, &m.v, 1, low, high, &worst);
-    mask second = ~(worst.low >= one.low);
-    worst.low = where(second, one.low, worst.low), worst.middle = where(one.middle > worst.middle, one.middle, worst.middle);
-    EACH(i, VARS) worst.part[i] = where(second, one.part[i], worst.part[i]);
+    EACH(i, 2) { /* V falls beyond Q = 1, so the sum of both may be positive where neither is in all of a box */
+        beyond(&m, 1, i ? 2 * P.rho : 0, low, high, &worst);
+        mask less = ~(worst.low >= one.low);
+        worst.low = where(less, one.low, worst.low), worst.middle = where(one.middle > worst.middle, one.middle, worst.middle);
+        EACH(k, VARS) worst.part[k] = where(less, one.part[k], worst.part[k]);
+        one = worst;
+    }
     enough = worst.low > 0;
     mask every = inside, first = ~(mask)all(0), mixed = ~inside & (q_low * low < 1) & ~(worst.middle >= 0);
     EACH(i, VARS) { /* where neither way holds for all of the box, halve what makes Q vary */

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ballbot_baselines.optimum.find import find_optima
 from ballbot_baselines.optimum.lower_bound import PlanarBound
 from ballbot_gym import machine_code
 from ballbot_gym.robot import default_params
@@ -26,6 +27,7 @@ _PAIRS, _FOURS = (list(itertools.combinations_with_replacement(range(4), n)) for
 _KNOTS = 16
 _WIDEST = 4096.0
 _FLAGS = ("-O3",)
+_PLANE = [0, 2, 4, 6]  # position, lean, speed and lean rate of a state
 
 
 class _Problem(ctypes.Structure):
@@ -234,3 +236,27 @@ def check_parts(
             yield (n + 1) / len(jobs), boxes, proven
             if not proven:
                 return
+
+
+def _optimal_costs(x: np.ndarray) -> np.ndarray:
+    """(n,) of planar states (n, 4); NaN where no optimum is found."""
+    x0 = np.zeros((len(x), 8))
+    x0[:, _PLANE] = x
+    optima = find_optima(Stabilize(), default_params(), x0, np.zeros((len(x0), 0)))
+    return np.array([np.nan if each is None else each.cost for each in optima])
+
+
+def _tightness(certificate: PlanarBound, count: int) -> tuple[float, np.ndarray]:
+    """How much of the optimal cost a bound is; nothing of it is proven.
+
+    Returns:
+        The share of the task's planar starts that the bound covers. (count,) the bound of random ones that it covers, divided
+        by the optimal cost.
+    """
+    task = Stabilize()
+    most = [task.start_position, task.start_lean, task.start_speed, task.start_lean_rate]
+    x0 = np.random.default_rng(5).uniform(-1, 1, (max(4 * count, 100_000), 4)) * most
+    bound = certificate.bound(x0, task.steps)
+    covered = np.isfinite(bound)
+    ratio = bound[covered][:count] / _optimal_costs(x0[covered][:count])
+    return float(covered.mean()), ratio[np.isfinite(ratio)]
