@@ -169,6 +169,16 @@ def test_the_first_reading_of_a_filter_does_not_take_unknown_friction_for_a_lean
     np.testing.assert_allclose(controller.filter.x[4:6], [0.5, -0.4], atol=0.05)
 
 
+def test_the_first_lean_of_a_robot_that_moves_is_not_that_of_a_model_linear_about_rest():
+    task, robot = make_task("stabilize", "omni"), replace(SAME, axle_friction=0.3)
+    env = BallbotEnv(task, "rk4", robot=robot, observation="sensors")
+    x = np.array([0.0, 0.0, 0.1, -0.05, 0.5, -0.4, *[0.0] * 5])
+    seen, _ = env.reset(seed=1, options={"state": x})
+    controller = FilteredController(task, robot, "-ekf", LqrController(task, robot))
+    controller.reset(0.0, seen, np.zeros(0))
+    np.testing.assert_allclose(controller.filter.x[2:4], x[2:4], atol=0.1)  # 0.06; 0.20 if linear about rest
+
+
 @pytest.mark.slow
 def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_of_mass_it_does_not_know():
     task = make_task("stabilize", "omni")

@@ -89,6 +89,12 @@ def test_the_motion_is_that_of_our_state(tmp_path):
     assert model.observed(np.zeros(0)).shape == (11,)
 
 
+def test_at_first_the_accelerometer_reads_what_a_robot_without_force_feels(tmp_path):
+    model = MujocoModel(mjcf(tmp_path))
+    model.reset(model.robot.rest())
+    np.testing.assert_allclose(model.readings[3:6], [0, 0, model.robot.gravity], atol=0.3 * model.robot.gravity)
+
+
 def test_all_wheels_together_turn_body_and_ball_against_each_other_as_in_the_equations(tmp_path):
     """Wheels without rollers roll in this motion alone."""
     model = MujocoModel(mjcf(tmp_path))

@@ -104,9 +104,24 @@ class MujocoModel:
         self.reset(self.robot.rest())
 
     def reset(self, x: np.ndarray) -> np.ndarray:
-        """Puts the robot into state x (11,), with a ball that rolls without slipping; returns `state`."""
-        mujoco, data, r = self._mujoco, self.data, self._radius
+        """Puts the robot into state x (11,), with a ball that rolls without slipping; returns `state`.
+
+        The accelerometer then reads what it would feel in a control step without force: contacts that were just made do not
+        press yet as they will.
+        """
         x = np.asarray(x, np.float64)
+        self._put(x)
+        self.step(np.zeros(3))
+        accelerations = self.readings[3:6]
+        speeds = self._put(x)
+        # gyroscope and encoders read as if the state lasted for a control step
+        self.readings = np.concatenate([self._felt()[:3], accelerations, self.control_dt * speeds])
+        self._start = x[:2].copy()
+        return self.state
+
+    def _put(self, x: np.ndarray) -> np.ndarray:
+        """Puts the robot into state x (11,); returns the speeds of the wheels (3,), rad/s."""
+        mujoco, data, r = self._mujoco, self.data, self._radius
         mujoco.mj_resetData(self.model, data)
         data.qpos[:] = self._pose
         gamma, theta, psi = x[2], x[3], x[8]
@@ -128,10 +143,7 @@ class MujocoModel:
             data.qvel[wheel.dof] = wheel.sign * speed
         data.ctrl[:] = self._held
         mujoco.mj_forward(self.model, data)
-        self._start = x[:2].copy()
-        angles = self.control_dt * speeds  # as if the state lasted for a control step
-        self.readings = np.concatenate([self._felt(), angles])
-        return self.state
+        return speeds
 
     def step(self, u: np.ndarray) -> np.ndarray:
         """Holds the wheels' forces u (3,), N, for a control step; returns `state`."""

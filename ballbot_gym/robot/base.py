@@ -83,6 +83,8 @@ class Robot(ABC):
     which states are equilibria."""
     CONTACT: ClassVar[bool] = False
     """Whether PyBullet and MuJoCo simulate the robot with contact on a floor, where it may slip."""
+    DRY_FRICTION: ClassVar[bool] = False
+    """Whether the drive may have dry friction, which stops a wheel within milliseconds."""
     PUSHABLE: ClassVar[bool] = False
     """Whether the action is the horizontal force on the robot, to which a push adds."""
     TRACK_FILTERS: ClassVar[bool] = False

@@ -23,7 +23,7 @@ The inertias `inertia` and `axial_inertia` are still those about all axes across
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -52,6 +52,8 @@ class GeneralOmni(Omni):
     The axis goes through the ball's centre. Where it points in the body is a convention: the axis about which the wheels have
     one zenith angle.
     """
+
+    DRY_FRICTION: ClassVar[bool] = True
 
     com_x: float = field(default=0.0, kw_only=True)
     com_y: float = field(default=0.0, kw_only=True)

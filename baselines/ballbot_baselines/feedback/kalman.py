@@ -321,10 +321,13 @@ class _DisturbanceFilter(SensorFilter):
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
         mean, deviations = self.expected_start(c)
-        self._z = np.concatenate([seen[9:11], mean[2:], np.zeros(5)])
-        self._p = np.diag([*deviations**2, *[self._of_bias] * 2, *[self._force] * 3])
-        found, slopes = self._with_slopes(self.model, np.zeros(3))
-        self._correct(seen, found[11:], slopes[11:], _OF_BOTH)
+        start = np.concatenate([seen[9:11], mean[2:], np.zeros(5)])
+        # Dry friction is far from linear between rest and the first speeds. So what the encoders say of these comes first.
+        for _ in range(2):
+            self._z, self._p = start.copy(), np.diag([*deviations**2, *[self._of_bias] * 2, *[self._force] * 3])
+            found, slopes = self._with_slopes(self.model, np.zeros(3))
+            self._correct(seen, found[11:], slopes[11:], _OF_BOTH)
+            start[4:6] = self._z[4:6]
         self.disturbance = self._z[16:].copy()
 
     def update(self, t: float, seen: np.ndarray, u: np.ndarray) -> None:

@@ -345,7 +345,7 @@ def _step(
     y, used, before, u, uncertain, dt = _split(step, m, m, actions, actions, actions, 1)
     model = Kind(robot, (*kind.numbers, *robot.SENSORS)).model(numbers)
     rates, x = _rates_with_angles(model, names), held[:size]
-    stiff = hasattr(model, "axle_friction")
+    stiff = robot.DRY_FRICTION
     past = _between(rates, x, held[-size:], before, dt[0]) if stiff else lambda ago: _ago(rates, x, before, ago)
     read_at = cache(lambda ago: _expected_readings(model, names, _tuple(past(ago)), before))
     means = casadi.vertcat(*[_mean(read_at, i, *each) for i, each in enumerate(times)])
