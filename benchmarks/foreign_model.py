@@ -5,7 +5,9 @@
 LQR with the numbers of the file records a log of 60 s, as docs/identify.md says, and `identify` finds robot and errors in it
 alone. A controller with that robot, behind the filter with these errors, then drives from random leans, speeds and places for
 8 s. The sensors have the noise of those of `omni`, in the log too. The motors may give less torque than in the file: then the
-robot that was identified has the same share of its force. Episodes that are in the file of results are not repeated.
+robot that was identified has the same share of its force. Episodes that are in the file of results are not repeated. The
+column "least torque" has the torque in N m with which the unstable part of the identified robot's linear model would just not
+grow from the start: a start that needs more than the motors give can hardly be saved.
 
 The controller `policy` is trained by DAgger for each of the leans, on starts like those that it drives from. Its optima are
 those of the robot without dry friction, and it overcomes this friction as LQR does. Policies in the folder of a log are used
@@ -23,12 +25,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import schur
+from scipy.optimize import linprog
 
 from ballbot_baselines import LqrController, NmpcController
 from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.identification.identify import identify
 from ballbot_baselines.identification.likelihood import Readings
 from ballbot_baselines.identification.logs import Log
+from ballbot_baselines.solvers.linearize import LinearQuadratic
 from ballbot_gym import MujocoModel, files, named_robot, register_robot, urdf_text
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Sensors, read_urdf, tilt
@@ -51,6 +56,7 @@ _LOST = 0.4  # rad of lean, at which the robot is lifted while it records
 _SPEED, _PLACE = 0.5, 0.5  # m/s and m, of the starts along each axis
 _SECONDS, _FALLEN, _NEAR = 8.0, 1.0, 0.1  # s; rad of tilt; m
 _SMALL, _AHEAD = np.radians(2), 0.3  # rad; s
+_GROWS = 1.001  # in a control step: what grows faster is unstable
 
 
 class FullTorque(LqrController):
@@ -92,12 +98,13 @@ class TrainedPolicy:
         return self._robot.overcoming(x, self._policy.act(t, x), self._task.control_dt)
 
 
-_CONTROLLERS: dict[str, Callable[[Any, Any], Controller]] = {
-    "lqr": LqrController,
-    "nmpc": NmpcController,
-    "full": FullTorque,
+_CONTROLLERS: dict[str, Callable[[Any, Any, Path], Controller]] = {
+    "lqr": lambda task, robot, _: LqrController(task, robot),
+    "nmpc": lambda task, robot, _: NmpcController(task, robot),
+    "full": lambda task, robot, _: FullTorque(task, robot),
+    "policy": TrainedPolicy,
 }
-_POLICY = "policy"
+"""Of a task, a robot and a file for what is trained."""
 
 
 def main() -> None:
@@ -105,7 +112,7 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("--hold", nargs="*", default=[], metavar="JOINT=RAD", help="where joints are held")
     parser.add_argument("--logs", nargs="+", choices=_LOGS, default=list(_LOGS))
-    parser.add_argument("--controllers", nargs="+", choices=[*_CONTROLLERS, _POLICY], default=["lqr"])
+    parser.add_argument("--controllers", nargs="+", choices=_CONTROLLERS, default=["lqr"])
     parser.add_argument("--leans", nargs="+", type=float, default=[5.0, 11.0, 17.0], help="degrees, for each axis")
     parser.add_argument("--torques", nargs="+", type=float, default=[2.0, 2.0, 4.0], help="N m, for each of the leans")
     parser.add_argument("--seeds", type=int, default=10)
@@ -227,21 +234,20 @@ def driven(model: MujocoModel, found: Identified, key: dict[str, str]) -> dict[s
         make_task("stabilize", "omni"), start_position=_PLACE, start_speed=_SPEED, start_lean=lean, start_lean_rate=1e-3
     )
     senses = key["sees"] == "sensors"
-    if key["controller"] == _POLICY:
-        file = found.folder / f"policy_{float(key['lean']):g}_{float(key['torque']):g}.json"
-        controller: Controller = TrainedPolicy(task, robot, file)
-    else:
-        controller = _CONTROLLERS[key["controller"]](task, robot)
+    file = found.folder / f"policy_{float(key['lean']):g}_{float(key['torque']):g}.json"
+    controller = _CONTROLLERS[key["controller"]](task, robot, file)
     if senses:
         controller = FilteredController(task, robot, "-ekf", controller, found.errors)
     x = np.zeros(11)
     x[:6] = rng.uniform(-1, 1, 6) * np.repeat([_PLACE, lean, _SPEED], 2)
     x, sensors, wrong = model.reset(x), Sensed(model, rng), []
+    least = f"{least_torque(task, robot, x):.2f}"
     seen, begin, dt = sensors.observed() if senses else x, time.process_time(), model.control_dt
     try:
         controller.reset(0.0, seen, np.zeros(0))
     except PlanError:
-        return {"fell": "no plan", "distance": "", "lean error": "", "seconds": f"{time.process_time() - begin:.1f}"}
+        seconds = f"{time.process_time() - begin:.1f}"
+        return {"least torque": least, "fell": "no plan", "distance": "", "lean error": "", "seconds": seconds}
     for step in range(round(_SECONDS / dt)):
         u = controller.act(step * dt, seen).clip(-robot.force_limit, robot.force_limit)
         if isinstance(controller, FilteredController):
@@ -252,11 +258,30 @@ def driven(model: MujocoModel, found: Identified, key: dict[str, str]) -> dict[s
             break
     after = np.array(wrong[round(1 / dt) :])
     return {
+        "least torque": least,
         "fell": str(bool(tilt(x) > _FALLEN)),
         "distance": f"{np.hypot(*x[:2]):.4f}",
         "lean error": f"{np.sqrt(np.mean(np.sum(after**2, axis=1))):.4f}" if len(after) else "",
         "seconds": f"{time.process_time() - begin:.1f}",
     }
+
+
+def least_torque(task: Any, robot: Any, x: np.ndarray) -> float:
+    """N m of every motor, with less than which the unstable part of the linear model about rest grows from state x.
+
+    This model has no dry friction.
+    """
+    free, rest = robot.without_dry_friction(), robot.rest()
+    ((a,), (b,)) = LinearQuadratic(task, free, rest[None], np.zeros((1, 3)), np.zeros(0)).dynamics
+    grows, own, count = schur(a.T, sort=lambda real, imaginary: np.hypot(real, imaginary) > _GROWS)
+    unstable = own[:, :count].T
+    # forces that hold it: unstable @ (a (x - rest) + b u) = unstable @ (x - rest)
+    part = unstable @ (x - rest)
+    held = np.hstack([unstable @ b, np.zeros((count, 1))])
+    within = np.block([[np.eye(3), -np.ones((3, 1))], [-np.eye(3), -np.ones((3, 1))]])
+    wanted = part - grows[:count, :count].T @ part
+    found = linprog([0, 0, 0, 1], within, np.zeros(6), held, wanted, bounds=(None, None))
+    return float(found.x[3] * robot.wheels.radius)
 
 
 def torque_of(model: MujocoModel) -> float:
@@ -265,16 +290,22 @@ def torque_of(model: MujocoModel) -> float:
 
 
 def summarize(rows: list[dict[str, Any]]) -> None:
-    """Prints how many episodes of each setting fall, and how many end near the origin."""
+    """Prints how many episodes of each setting fall, and how many end near the origin, of all and of those not too hard."""
     names = ("model", "held", "log", "controller", "sees", "lean", "torque")
     for setting in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
         own = [row for row in rows if tuple(row[name] for name in names) == setting]
         standing = [float(row["distance"]) for row in own if row["fell"] == "False"]
-        rests = sum(each < _NEAR for each in standing)
         ends = f"{min(standing):.3f} to {max(standing):.3f} m" if standing else "-"
+        enough = [row for row in own if float(row["least torque"]) <= float(row["torque"])]
         print(
-            f"{' '.join(filter(None, setting))}: {len(own)} seeds, {len(own) - len(standing)} fall, {rests} rest, {ends}"
+            f"{' '.join(filter(None, setting))}: {len(own)} seeds, {len(own) - len(standing)} fall, {at_rest(own)} rest, "
+            f"{ends}; {len(enough)} need at most this torque, of which {at_rest(enough)} rest"
         )
+
+
+def at_rest(rows: list[dict[str, Any]]) -> int:
+    """How many episodes end near the origin."""
+    return sum(row["fell"] == "False" and float(row["distance"]) < _NEAR for row in rows)
 
 
 if __name__ == "__main__":
