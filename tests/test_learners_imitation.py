@@ -13,6 +13,7 @@ from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Randomization, default_params
 from ballbot_gym.tasks import TASKS
+from ballbot_train.evaluation import fresh
 from ballbot_train.learning import dagger, routing, training
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import load_demos
@@ -92,6 +93,22 @@ def test_dagger_labels_what_it_meets(name, monkeypatch):
     assert state["observations"].shape[1] == len(task.observation_scale)
     assert state["observations"].isfinite().all()
     assert state["actions"].abs().max() <= 1
+
+
+@pytest.mark.parametrize("hard", [dagger._HARD, dagger._HARD_OF_MANY])
+def test_a_share_of_a_later_round_begins_where_the_learner_fails(hard, monkeypatch):
+    share, _, seconds = hard
+    task, learner = make_task("stabilize"), dagger.make(make_task("stabilize"), default_params(), TINY_DAGGER)
+    monkeypatch.setattr(learner, "_hard", (share, 16, seconds))
+
+    def failures():
+        x, c = learner._beginnings(64, np.random.default_rng(0))
+        return int(fresh.run_policy(learner.network, task, x, c, np.zeros((64, 0))).failure.sum())
+
+    random = failures()
+    learner.iteration = 1
+    assert 0 < random < 32
+    assert failures() >= 64 * share + (1 - share) * random / 2
 
 
 @pytest.mark.parametrize("squash", ["tanh", "clip"])

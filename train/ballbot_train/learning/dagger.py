@@ -15,7 +15,8 @@ the goal more often. If observations depend on the past, on noise or on delayed 
 Where a learner decides first on which sides it passes obstacles, the optima are those that pass them on these sides.
 
 A share of the episodes begins where the learner fails or pays most, because failures are at the edge of what can be recovered
-from. On a track the expert has access to each episode's robot. The learner gets observations alone.
+from. Where these show within seconds, very many starts are tried, because failures become rare. On a track the expert has
+access to each episode's robot. The learner gets observations alone.
 """
 
 import itertools
@@ -29,6 +30,7 @@ import numpy as np
 import torch
 
 from ballbot_baselines import Backoff, Optimum, find_optima
+from ballbot_baselines.feedback.lqr import equilibrium_gain
 from ballbot_baselines.feedback.trajopt import EXECUTED
 from ballbot_gym.robot import Randomization, Robot, registered_name
 from ballbot_gym.tasks import Task
@@ -73,7 +75,7 @@ class DaggerConfig(Settings):
 _FEW = DaggerConfig(iterations=20, evaluations=5, batch_size=256, learning_rate=1e-2, hidden=(64, 64))
 TUNED: dict[str, DaggerConfig] = {
     "": DaggerConfig(),
-    "stabilize": replace(_FEW, gathering_iterations=4, gradient_steps=1000, symmetry="odd"),
+    "stabilize": replace(_FEW, gathering_iterations=8, gradient_steps=1000, symmetry="odd"),
     "turn": DaggerConfig(symmetry="frame", backoff=Backoff(goal=0.4, grip=EXECUTED.grip)),
     "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred"),
     "weave": replace(
@@ -99,7 +101,10 @@ _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 # the scale of a distance in each component of a state, SI units
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
-_HARD_SHARE, _HARD_AMONG = 0.25, 16  # of an iteration's episodes; how many are drawn for each of these
+# of an iteration's episodes; how many are drawn for each of these, and for how many seconds at most these are tried
+_HARD, _HARD_OF_MANY = (0.25, 16, math.inf), (0.5, 256, 2.0)
+_TOGETHER = 4096  # starts that are tried at once
+_LARGE = 0.1  # error of an action
 _ROBOTS = 16  # of an iteration on a track
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
@@ -202,11 +207,15 @@ class Dagger:
         present = not (history or varied.varies_actuator or varied.is_noisy)
         self._around = present and not task.first_exit
         """Whether samples label the states around them too; see the top of this file."""
+        alone = self._around and task.routed_frame is None
+        # a robot that is to come to rest shows within seconds whether it can
+        rests = alone and equilibrium_gain(task, params) is not None
+        self._hard = _HARD_OF_MANY if rests else _HARD
         # slopes are fitted best by smooth layers, and labels at the limits by a clip; with routes, it touched more obstacles
-        activation = "silu" if self._around else "tanh"
-        squash = "clip" if self._around and task.routed_frame is None else "tanh"
+        activation, squash = "silu" if self._around else "tanh", "clip" if alone else "tanh"
         self.network = actor_for(task, params, config, history, False, start, activation, squash)
-        self._fit = Fit(self.network, self.network.acting)
+        # where the optimum jumps between neighbouring starts, a mean of both sides is worse than either
+        self._fit = Fit(self.network, self.network.acting, _LARGE if rests else math.inf)
         empty = np.zeros((0, self.network.spec.seen)), np.zeros((0, params.action_size)), np.zeros(0)
         self._samples = self._samples_of(*(shown or empty))
 
@@ -260,17 +269,30 @@ class Dagger:
         """Initial states (count, 8) and constants (count, nc). As far as there are some, a share are the hardest
         of many drawn: those in which the learner does not succeed, and then those that cost it most.
         """
-        hard = round(_HARD_SHARE * count) if self.iteration else 0
-        some, among = count - hard, _HARD_AMONG * hard
-        x, c = map(np.array, zip(*(self._task.sample(rng, self._params) for _ in range(some + among)), strict=True))
+        share, among, seconds = self._hard
+        hard = round(share * count) if self.iteration else 0
+        some = count - hard
+        draws = (self._task.sample(rng, self._params) for _ in range(some + among * hard))
+        x, c = map(np.array, zip(*draws, strict=True))
         if not hard:
             return x, c
-        robot = registered_name(self._params)
-        ran = fresh.run_policy(self.network, self._task, x[some:], c[some:], np.zeros((among, 0)), robot)
-        hardest = np.lexsort((-ran.cost.numpy(), ran.success.numpy()))
-        rows = np.append(np.arange(some), some + hardest[:hard])
+        rows = np.append(np.arange(some), some + self._hardest(x[some:], c[some:], seconds)[:hard])
         rng.shuffle(rows)
         return x[rows], c[rows]
+
+    def _hardest(self, x: np.ndarray, c: np.ndarray, seconds: float) -> np.ndarray:
+        """(B,) the order of starts x (B, 8) with constants c (B, nc), the hardest first, by what the learner does there."""
+        task, robot = self._task, registered_name(self._params)
+        shorter = task.control_dt * math.ceil(min(seconds, task.duration) / task.control_dt)
+        whole = shorter >= task.duration
+        tried = task if whole else replace(task, duration=shorter)
+        bad, costs = [], []
+        for first in range(0, len(x), _TOGETHER):
+            some = slice(first, first + _TOGETHER)
+            ran = fresh.run_policy(self.network, tried, x[some], c[some], np.zeros((len(x[some]), 0)), robot)
+            bad.append(~ran.success if whole else ran.failure)
+            costs.append(ran.cost)
+        return np.lexsort((-torch.cat(costs).numpy(), ~torch.cat(bad).numpy()))
 
     def _labelled_run(
         self,

@@ -1,11 +1,13 @@
 """Supervised fitting: labelled observations, and a policy network that is fitted to them."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.functional import huber_loss
 
 from ballbot_train.learning.state import load_state, state_of
 
@@ -53,9 +55,20 @@ class Samples:
 class Fit:
     """Fits a network to samples: Adam on the weighted mean squared error of its actions."""
 
-    def __init__(self, network: torch.nn.Module, act: Callable[[torch.Tensor], torch.Tensor] | None = None):
-        """Args: network: to fit; act: with it, from observations (n, no) to actions (n, 2); default, what it gives."""
-        self.network, self._act = network, act or network
+    def __init__(
+        self,
+        network: torch.nn.Module,
+        act: Callable[[torch.Tensor], torch.Tensor] | None = None,
+        large: float = math.inf,
+    ):
+        """Makes a fit.
+
+        Args:
+            network: to fit.
+            act: with it, from observations (n, no) to actions (n, 2); default, what it gives.
+            large: errors beyond it count linearly (Huber).
+        """
+        self.network, self._act, self._large = network, act or network, large
         self._optimizer = torch.optim.Adam(network.parameters(), fused=True)
 
     def run(
@@ -68,7 +81,7 @@ class Fit:
             some = min(_DRAWN_AT_ONCE, gradient_steps - first)
             batches = (part.split(size) for part in samples.draw(some * size, rng))
             for observations, actions, weights in zip(*batches, strict=True):
-                error = (self._act(observations) - actions) ** 2
+                error = 2 * huber_loss(self._act(observations), actions, reduction="none", delta=self._large)
                 loss = (weights * error.mean(1)).sum() / weights.sum()
                 self._optimizer.zero_grad()
                 loss.backward()
