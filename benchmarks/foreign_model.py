@@ -83,7 +83,7 @@ class TrainedPolicy:
         register_robot(name, urdf)
         smooth = named_robot(name)
         if not file.exists():
-            given = {"iterations": 8, "gathering_iterations": 2, "episodes_per_iteration": 8, "symmetry": "none"}
+            given = {"iterations": 24, "gathering_iterations": 4, "episodes_per_iteration": 32, "symmetry": "none"}
             settings = replace(LEARNERS["dagger"].settings("stabilize"), **given)
             learner = LEARNERS["dagger"].make(task, smooth, settings, 0)
             while learner.iteration < learner.iterations:
