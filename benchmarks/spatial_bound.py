@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from planar_bound import DT, EFFORT, LIMIT, LOSS, ROBOT, TASK, solve
 
-from ballbot_baselines import find_optima
+from ballbot_baselines.proofs.planar_bound import _optimal_costs
 from ballbot_baselines.solvers.riccati import discrete_lqr
 
 COST = np.repeat([TASK.position_weight, *[TASK.rest_weight] * 3], 2)
@@ -82,18 +82,12 @@ class Fit:
         return ((m - self.monomials(self.after(z, u))) / DT + self.last * m) / self.rate(z, u)[:, None]
 
 
-def optimal_costs(x: np.ndarray) -> np.ndarray:
-    """(n,) of states; NaN where no optimum is found."""
-    optima = find_optima(TASK, ROBOT, x, np.zeros((len(x), 0)))
-    return np.array([np.nan if each is None else each.cost for each in optima])
-
-
 def trial(rho: float, margin: float, last: float, states: int, samples: int, rounds: int) -> None:
     """Fits V for one rho and prints how far it is."""
     fit, rng = Fit(rho, margin, last), np.random.default_rng(3)
     d = rng.normal(size=(states, 8))
     z = np.sqrt(1.8 * rho) * (d * rng.random((states, 1)) ** 0.2 / np.linalg.norm(d, axis=1)[:, None]) @ fit.spread.T
-    cost = optimal_costs(z @ fit.t.T)
+    cost = _optimal_costs(z @ fit.t.T, range(8))
     near = cost < 1.3 * rho
     z, cost = z[near], cost[near]
     m = fit.monomials(z) / cost[:, None]

@@ -9,7 +9,7 @@ import ctypes
 import itertools
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from fractions import Fraction
 from functools import cache
@@ -238,10 +238,10 @@ def check_parts(
                 return
 
 
-def _optimal_costs(x: np.ndarray) -> np.ndarray:
-    """(n,) of planar states (n, 4); NaN where no optimum is found."""
+def _optimal_costs(x: np.ndarray, components: Sequence[int] = _PLANE) -> np.ndarray:
+    """(n,) of states with some components x, of a plane by default, and else zeros; NaN where no optimum is found."""
     x0 = np.zeros((len(x), 8))
-    x0[:, _PLANE] = x
+    x0[:, components] = x
     optima = find_optima(Stabilize(), default_params(), x0, np.zeros((len(x0), 0)))
     return np.array([np.nan if each is None else each.cost for each in optima])
 
