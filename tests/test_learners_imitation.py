@@ -97,9 +97,9 @@ def test_dagger_labels_what_it_meets(name, monkeypatch):
 
 @pytest.mark.parametrize("hard", [dagger._HARD, dagger._HARD_OF_MANY])
 def test_a_share_of_a_later_round_begins_where_the_learner_fails(hard, monkeypatch):
-    share, _, seconds = hard
+    share, _, seconds, again = hard
     task, learner = make_task("stabilize"), dagger.make(make_task("stabilize"), default_params(), TINY_DAGGER)
-    monkeypatch.setattr(learner, "_hard", (share, 16, seconds))
+    monkeypatch.setattr(learner, "_hard", (share, 16, seconds, again))
 
     def failures():
         x, c = learner._beginnings(64, np.random.default_rng(0))

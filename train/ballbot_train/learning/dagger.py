@@ -15,8 +15,8 @@ the goal more often. If observations depend on the past, on noise or on delayed 
 Where a learner decides first on which sides it passes obstacles, the optima are those that pass them on these sides.
 
 A share of the episodes begins where the learner fails or pays most, because failures are at the edge of what can be recovered
-from. Where these show within seconds, very many starts are tried, because failures become rare. On a track the expert has
-access to each episode's robot. The learner gets observations alone.
+from. Where these show within seconds, very many starts are tried, because failures become rare, and the hardest of them again
+in later iterations. On a track the expert has access to each episode's robot. The learner gets observations alone.
 """
 
 import itertools
@@ -101,8 +101,9 @@ _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 # the scale of a distance in each component of a state, SI units
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
-# of an iteration's episodes; how many are drawn for each of these, and for how many seconds at most these are tried
-_HARD, _HARD_OF_MANY = (0.25, 16, math.inf), (0.5, 256, 2.0)
+# of an iteration's episodes; how many are drawn for each of these, for how many seconds at most these are tried, and how many
+# of them are tried again in all later iterations
+_HARD, _HARD_OF_MANY = (0.25, 16, math.inf, 0), (0.5, 256, 2.0, 4)
 _TOGETHER = 4096  # starts that are tried at once
 _LARGE = 0.1  # error of an action
 _ROBOTS = 16  # of an iteration on a track
@@ -211,6 +212,8 @@ class Dagger:
         # a robot that is to come to rest shows within seconds whether it can
         rests = alone and equilibrium_gain(task, params) is not None
         self._hard = _HARD_OF_MANY if rests else _HARD
+        self._tried = np.zeros((0, params.state_size)), np.zeros((0, len(task.constant_names)))
+        """Initial states and constants of the hardest starts of earlier iterations."""
         # slopes are fitted best by smooth layers, and labels at the limits by a clip; with routes, it touched more obstacles
         activation, squash = "silu" if self._around else "tanh", "clip" if alone else "tanh"
         self.network = actor_for(task, params, config, history, False, start, activation, squash)
@@ -233,10 +236,16 @@ class Dagger:
         return {"loss/imitation": loss, "train/learning_rate": rate, "train/samples": len(self._samples), **figures}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"iteration": self.iteration, "samples": self._samples.tensors(), **self._fit.state_dict()}
+        tried = [torch.as_tensor(part) for part in self._tried]
+        return {
+            "iteration": self.iteration,
+            "samples": self._samples.tensors(),
+            "tried": tried,
+            **self._fit.state_dict(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.iteration = state["iteration"]
+        self.iteration, self._tried = state["iteration"], tuple(part.numpy() for part in state["tried"])
         for name, tensor in state["samples"].items():
             setattr(self._samples, name, tensor)
         self._fit.load_state_dict(state)
@@ -267,16 +276,21 @@ class Dagger:
 
     def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Initial states (count, 8) and constants (count, nc). As far as there are some, a share are the hardest
-        of many drawn: those in which the learner does not succeed, and then those that cost it most.
+        of many: those in which the learner does not succeed, and then those that cost it most.
         """
-        share, among, seconds = self._hard
+        share, among, seconds, again = self._hard
         hard = round(share * count) if self.iteration else 0
         some = count - hard
         draws = (self._task.sample(rng, self._params) for _ in range(some + among * hard))
         x, c = map(np.array, zip(*draws, strict=True))
         if not hard:
             return x, c
-        rows = np.append(np.arange(some), some + self._hardest(x[some:], c[some:], seconds)[:hard])
+        x, c = (np.concatenate([drawn, earlier]) for drawn, earlier in zip((x, c), self._tried, strict=True))
+        order = some + self._hardest(x[some:], c[some:], seconds)
+        # so few fail that an iteration's own draws do not show what the learner has unlearned
+        kept = order[: again * hard * self.iteration]
+        self._tried = x[kept], c[kept]
+        rows = np.append(np.arange(some), order[:hard])
         rng.shuffle(rows)
         return x[rows], c[rows]
 
