@@ -101,8 +101,8 @@ _WINDOW = 0.5  # s, for which a state may be ahead of its optimum or behind it
 # the scale of a distance in each component of a state, SI units
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
-# of an iteration's episodes; how many are drawn for each of these, for how many seconds at most these are tried, and how many
-# of them are tried again in all later iterations
+# of an iteration's episodes; how many are drawn for each of these, and for how many seconds at most these are tried; of the
+# hardest so far, for each of these in each iteration, how many are tried again
 _HARD, _HARD_OF_MANY = (0.25, 16, math.inf, 0), (0.5, 256, 2.0, 4)
 _TOGETHER = 4096  # starts that are tried at once
 _LARGE = 0.1  # error of an action
