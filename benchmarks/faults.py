@@ -105,7 +105,7 @@ COMMANDS = {
     ),
     "basins": _command("basins --controllers lqr --points 5 --physics rk4", _basins),
     "certify": _command("certify --tasks turn --episodes 6", _sets),
-    "evaluate": _command("evaluate shac --fresh 20 --optima 4", _fresh),
+    "evaluate": _command("evaluate apg --fresh 20 --optima 4", _fresh),
     "transfer": _command(
         "transfer --tasks turn --controllers lqr --made-for paper rolling --episodes 20 --physics rk4", _episodes
     ),

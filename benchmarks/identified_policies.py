@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["orbit", "turn"])
     parser.add_argument("--physics", default="mujoco")
     parser.add_argument("--robots", type=int, default=4)
-    parser.add_argument("--start", default="shac", help="the shipped policy of the nominal robot")
+    parser.add_argument("--start", default="apg", help="the shipped policy of the nominal robot")
     parser.add_argument("--iterations", type=int, default=200)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--episode-seconds", type=float, default=4.0)

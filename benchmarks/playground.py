@@ -58,7 +58,7 @@ def measure(
     minutes: float = 10.0,
     task: str = "stabilize",
     controller: str = "lqr",
-    ghosts: tuple[str, ...] = ("shac",),
+    ghosts: tuple[str, ...] = ("apg",),
     physics: str = "bullet",
     out: Path = Path("runs/playground"),
 ) -> None:

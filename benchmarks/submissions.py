@@ -30,7 +30,7 @@ EPISODES = 3
 HONEST = [(task, "lqr", physics, "paper") for task in TASKS for physics in PHYSICS]
 HONEST += [("stabilize", "sac", physics, "paper") for physics in PHYSICS]
 HONEST += [("orbit", "sac", physics, "paper") for physics in PHYSICS]
-HONEST += [("turn", "shac", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
+HONEST += [("turn", "apg", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
 HONEST += [("stabilize", "lqr", physics, "kugle") for physics in ("bullet", "mujoco")]
 
 

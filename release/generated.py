@@ -82,7 +82,7 @@ def experts(task: str, robot: str) -> None:
 
 def policies() -> None:
     """Runs a policy in many episodes at once. All policies run by the same code."""
-    evaluate_fresh("shac", "stabilize", _BATCH, workers=1)
+    evaluate_fresh("apg", "stabilize", _BATCH, workers=1)
 
 
 def runs() -> Iterator[tuple[str, Callable[[], None]]]:

@@ -19,12 +19,12 @@ FEW: dict[str, Any] = {"searches": 5, "rounds": 3}
 
 @pytest.fixture(scope="module")
 def fresh():
-    return evaluate_fresh("shac", "stabilize", 20, seed=3)
+    return evaluate_fresh("apg", "stabilize", 20, seed=3)
 
 
 @pytest.fixture(scope="module")
 def found(fresh):
-    return hard_starts("shac", fresh, **FEW)
+    return hard_starts("apg", fresh, **FEW)
 
 
 def test_searches_begin_at_the_hardest_episodes_and_end_at_harder_ones(fresh, found):
@@ -40,7 +40,7 @@ def test_searches_begin_at_the_hardest_episodes_and_end_at_harder_ones(fresh, fo
 
 def test_gradient_ascent_goes_on_from_the_hardest_ends(fresh, found, monkeypatch):
     monkeypatch.setattr(adversarial, "_CLIMBS", 0)
-    _, random = hard_starts("shac", fresh, **FEW)
+    _, random = hard_starts("apg", fresh, **FEW)
     assert (found[1].hardness >= random.hardness).all()
     assert found[1].hardness[0] > 1.01 * random.hardness[0]
 
@@ -55,7 +55,7 @@ def test_starts_are_in_the_set_from_which_episodes_are_drawn(found):
 def test_costs_are_those_of_the_environment(found):
     _, ended = found
     env = BallbotEnv("stabilize", physics="rk4")
-    policy = load_policy(shipped_policies(env.task)["shac"])
+    policy = load_policy(shipped_policies(env.task)["apg"])
     for i in range(2):
         run = rollout(env, policy, options={"state": ended.states[i], "constants": ended.constants[i]})
         assert run.cost == pytest.approx(ended.costs[i], rel=1e-5)
@@ -64,7 +64,7 @@ def test_costs_are_those_of_the_environment(found):
 @pytest.mark.slow
 def test_processes_find_what_one_does(fresh, found, monkeypatch):
     monkeypatch.setattr(adversarial, "_TOGETHER", 3)
-    one, two = (hard_starts("shac", fresh, workers, **FEW) for workers in (1, 2))
+    one, two = (hard_starts("apg", fresh, workers, **FEW) for workers in (1, 2))
     for mine, theirs in zip(one, two, strict=True):
         np.testing.assert_array_equal(mine.states, theirs.states)
         np.testing.assert_array_equal(mine.optima, theirs.optima)
@@ -102,7 +102,7 @@ def test_the_command_writes_the_starts_and_motions_that_replay_shows(typed, tmp_
     monkeypatch.setattr(adversarial, "hard_starts", partial(hard_starts, rounds=2))
     monkeypatch.setattr(adversarial, "_CHECKED", 0)  # other tests search these optima twice
     code, said = typed(
-        *("evaluate", "shac", "--task", "stabilize", "--fresh", "2", "--optima", "0"),
+        *("evaluate", "apg", "--task", "stabilize", "--fresh", "2", "--optima", "0"),
         *("--adversarial", "--workers", "1", "--out", str(tmp_path)),
     )
     assert code == 0, said
@@ -114,6 +114,6 @@ def test_the_command_writes_the_starts_and_motions_that_replay_shows(typed, tmp_
 
 
 def test_the_command_needs_fresh_episodes(typed, tmp_path):
-    code, said = typed("evaluate", "shac", "--task", "stabilize", "--adversarial", "--out", str(tmp_path))
+    code, said = typed("evaluate", "apg", "--task", "stabilize", "--adversarial", "--out", str(tmp_path))
     assert code == 1
     assert "give --fresh with --adversarial" in said

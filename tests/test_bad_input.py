@@ -565,22 +565,22 @@ TYPED = [
     ("train sac --history 2", "sac does not support a history (--history); train with apg or dagger or ppo"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
-    ("evaluate shac --fresh 0", "the number of fresh episodes must be 1 to 1,000,000, not 0"),
-    ("evaluate shac --optima 11", "give --optima with --fresh"),
-    ("evaluate shac --fresh 10 --physics bullet", "leave out --physics"),
-    ("evaluate shac --episodes 201", "episodes must be 1 to 200, not 201"),
-    ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
-    ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
+    ("evaluate apg --fresh 0", "the number of fresh episodes must be 1 to 1,000,000, not 0"),
+    ("evaluate apg --optima 11", "give --optima with --fresh"),
+    ("evaluate apg --fresh 10 --physics bullet", "leave out --physics"),
+    ("evaluate apg --episodes 201", "episodes must be 1 to 200, not 201"),
+    ("evaluate apg --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
+    ("evaluate apg --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
-    ("evaluate shac-ekf --robot omni_strong --fresh 10", "shac-ekf is behind the filter of sensors"),
+    ("evaluate apg-ekf --robot omni_strong --fresh 10", "apg-ekf is behind the filter of sensors"),
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),
     ("train apg --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
-    ("evaluate apg --fresh 10", "unknown controller apg"),  # no policy has this name
+    ("evaluate shac --fresh 10", "unknown controller shac"),  # no policy has this name
     ("replay stabilize turn", "give one task"),
     ("export lqr", "lqr is an expert"),
-    ("export shac-ekf --task orbit --robot omni_strong --format c", "leave out -ekf"),
+    ("export apg-ekf --task orbit --robot omni_strong --format c", "leave out -ekf"),
 ]
 
 

@@ -82,7 +82,7 @@ def test_a_compiled_controller_drives_certified_episodes_to_the_same_ends(task, 
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "orbit-shac-late" else pytest.mark.slow) for name in SHIPPED_NAMES]
+    "name", [pytest.param(name, marks=[] if name == "orbit-apg-late" else pytest.mark.slow) for name in SHIPPED_NAMES]
 )
 def test_every_shipped_policy_passes_the_test_in_its_file(name, tmp_path):
     task, robot = task_and_robot(name)
@@ -121,7 +121,7 @@ class FromSensors:
 
 @pytest.mark.parametrize(
     ("name", "robot", "episodes"),
-    [("shac-ekf", "omni_strong", 2), pytest.param("lqr-ekf", "omni", 20, marks=pytest.mark.slow)],
+    [("apg-ekf", "omni_strong", 2), pytest.param("lqr-ekf", "omni", 20, marks=pytest.mark.slow)],
 )
 def test_a_compiled_filter_drives_certified_episodes_from_sensors_to_the_same_ends(name, robot, episodes, tmp_path):
     export(name, task="stabilize", format="c", out=tmp_path / "filtered.c", robot=robot)

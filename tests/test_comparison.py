@@ -8,7 +8,7 @@ from builders import result
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.statistics import Interval
 
-EXPERT, POLICY = "lqr", "shac"
+EXPERT, POLICY = "lqr", "apg"
 
 
 def results(regrets, controller=EXPERT, failures=()):

@@ -127,8 +127,8 @@ def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):
     demos = load_demos(folder, task)
     policy = load_policy(shipped_policies(task)["dagger"], task)
     np.testing.assert_allclose(policy.predict(demos.observations)[0], demos.actions, atol=1e-5)
-    with pytest.raises(ValueError, match=f"unknown expert shac; known: lqr, .*{', '.join(shipped_policies(task))}$"):
-        DemoConfig("orbit", "shac")
+    with pytest.raises(ValueError, match=f"unknown expert apg; known: lqr, .*{', '.join(shipped_policies(task))}$"):
+        DemoConfig("orbit", "apg")
 
 
 def test_its_command_makes_it_anew(dataset, tmp_path, monkeypatch):

@@ -251,13 +251,12 @@ def test_the_readme_s_results_are_rows_of_the_leaderboard():
 
 
 def test_rows_and_policies_say_by_which_learners_they_came():
-    assert (
-        shipped_ways()[PolicyFile(SHIPPED / "stabilize-ppo.json").weights_digest()] == "dagger → shac → ppo"
-    )  # demonstrations of shac count
-    assert shipped_ways()[PolicyFile(SHIPPED / "turn-shac.json").weights_digest()] == "dagger → shac → ppo → shac"
+    way_of_demonstrations = "dagger → apg → ppo"
+    assert shipped_ways()[PolicyFile(SHIPPED / "stabilize-ppo.json").weights_digest()] == way_of_demonstrations
+    assert shipped_ways()[PolicyFile(SHIPPED / "turn-apg.json").weights_digest()] == "dagger → apg → ppo → apg"
     assert shipped_ways()[PolicyFile(SHIPPED / "weave-dagger.json").weights_digest()] == "dagger"
-    assert shipped_ways()[PolicyFile(SHIPPED / "stabilize-omni_strong-shac.json").weights_digest()] == "shac"
-    entries = [entry for entry in read_entries() if entry.name in ("dagger", "shac", "sac", "ppo")]
+    assert shipped_ways()[PolicyFile(SHIPPED / "stabilize-omni_strong-apg.json").weights_digest()] == "apg"
+    entries = [entry for entry in read_entries() if entry.name in ("dagger", "apg", "sac", "ppo")]
     assert entries
     assert all(shipped_ways()[entry.policy].endswith(entry.name) for entry in entries)
 

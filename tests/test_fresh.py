@@ -147,7 +147,7 @@ def test_wilson_s_interval_is_not_empty_where_nothing_failed():
 
 
 def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(monkeypatch):
-    result = evaluate_fresh("shac", "stabilize", 2)
+    result = evaluate_fresh("apg", "stabilize", 2)
     optima = result.with_optima(2, 1).optima
     from ballbot_baselines.optimum import certification
 
@@ -178,13 +178,13 @@ def test_what_does_not_act_is_refused():
         evaluate_fresh(3, "turn", 1)
     with pytest.raises(ValueError, match="trajopt is an expert"):
         evaluate_fresh("trajopt", "turn", 1)
-    with pytest.raises(ValueError, match="unknown controller 'apg'"):
-        evaluate_fresh("apg", "turn", 1)
+    with pytest.raises(ValueError, match="unknown controller 'shac'"):
+        evaluate_fresh("shac", "turn", 1)
 
 
 def test_fresh_episodes_and_training_say_how_many_stand_beside_the_goal():
     task = TASKS["stabilize"]()
-    policy = load_policy(shipped_policies(task)["shac"])
+    policy = load_policy(shipped_policies(task)["apg"])
     beside = torch.zeros(8)
     beside[0] = 0.12 / task.observation_scale[0]  # m; the goal is a circle of 0.1 m
     found = evaluate_fresh(lambda seen: policy.network(seen - beside), "stabilize", 20)
@@ -204,12 +204,12 @@ def test_validation_prices_an_episode_without_success_as_failing_at_once():
 
 def test_results_of_another_policy_are_not_replaced(tmp_path):
     few: dict[str, Any] = {"task": "stabilize", "workers": 1, "optima": 0, "out": tmp_path}
-    evaluate("shac", fresh=2, **few)
+    evaluate("apg", fresh=2, **few)
     before = (tmp_path / "fresh.json").read_bytes()
-    for policy, other in (("ppo", {}), ("shac", {"robot": "rolling"}), ("shac", {"randomization": "late"})):
+    for policy, other in (("ppo", {}), ("apg", {"robot": "rolling"}), ("apg", {"randomization": "late"})):
         changed = next(iter(other), "policy")
         with pytest.raises(ValueError, match=f"holds results of {changed} .*; give another --out"):
             evaluate(policy, fresh=2, **few, **other)
     assert (tmp_path / "fresh.json").read_bytes() == before
-    evaluate("shac", fresh=3, **few)
+    evaluate("apg", fresh=3, **few)
     assert (tmp_path / "fresh.json").read_bytes() != before

@@ -90,7 +90,7 @@ def test_paths_are_shortened_to_what_tells_them_apart() -> None:
 @pytest.fixture
 def two_policies(tmp_path: Path) -> list[str]:
     shipped, paths = shipped_policies(Stabilize()), []
-    for folder, learner in (("a", "shac"), ("b", "ppo")):
+    for folder, learner in (("a", "apg"), ("b", "ppo")):
         (tmp_path / folder).mkdir()
         for ending in (".json", ".safetensors"):
             copied = tmp_path / folder / f"policy{ending}"
@@ -168,7 +168,7 @@ def test_rows_of_two_problems_of_one_name_do_not_share_a_table(tmp_path: Path, m
     Dearer.__name__ = "Stabilize"
     monkeypatch.setitem(TASKS, "stabilize", Dearer)
     with pytest.raises(ValueError, match="another problem stabilize: its costs have changed since"):
-        evaluate("shac", "stabilize", 1, "rk4", out=tmp_path)
+        evaluate("apg", "stabilize", 1, "rk4", out=tmp_path)
     assert [result.controller for result in read_results(tmp_path)[1]] == ["lqr"]
 
 
@@ -182,18 +182,18 @@ def test_labels_of_one_figure_are_different() -> None:
 
 def test_a_shipped_policy_is_called_by_the_whole_way_of_its_training() -> None:
     ways = {
-        "turn/ppo": "dagger → shac → ppo",
-        "turn/shac-late": "dagger → shac",
+        "turn/ppo": "dagger → apg → ppo",
+        "turn/apg-late": "dagger → apg",
         "orbit/ppo": "ppo",
         "rolling/turn/ppo": "ppo",
     }
-    rows = [Row("turn", name) for name in ("ppo", "shac-late", "lqr", "a/ppo.json")] + [Row("orbit", "ppo")]
+    rows = [Row("turn", name) for name in ("ppo", "apg-late", "lqr", "a/ppo.json")] + [Row("orbit", "ppo")]
     shown = {"task": lambda row: row.task, "controller": lambda row: row.controller}
     cells = [controller for _, controller in table_cells(shown, rows, ways)]
-    assert cells == ["dagger → shac → ppo", "dagger → shac-late", "lqr", "ppo.json", "ppo"]
+    assert cells == ["dagger → apg → ppo", "dagger → apg-late", "lqr", "ppo.json", "ppo"]
     made = Row("turn", "ppo", labels={"made_for": "rolling", "robot": "paper"})
     assert table_cells(shown, [made], ways) == [["turn", "ppo"]]
-    assert labels(["ppo", "lqr"], "turn", ways) == {"ppo": "DAgger → SHAC → PPO", "lqr": "LQR"}
+    assert labels(["ppo", "lqr"], "turn", ways) == {"ppo": "DAgger → APG → PPO", "lqr": "LQR"}
 
 
 def test_table_terminal_report_and_figure_show_the_whole_way(
@@ -202,14 +202,14 @@ def test_table_terminal_report_and_figure_show_the_whole_way(
     figure = {}
     monkeypatch.setattr(figures, "regret_figure", lambda *given: figure.setdefault("made", made_by(*given)))
     benchmark(["stabilize"], ["ppo"], episodes=1, physics="rk4", out=tmp_path)
-    way = "dagger → shac → ppo"
+    way = "dagger → apg → ppo"
     assert way in " ".join(capsys.readouterr().out.split())
     assert way in (tmp_path / "leaderboard.md").read_text()
     page = (tmp_path / "report.html").read_text()
     assert way in page
-    assert "DAgger → SHAC → PPO" in page
+    assert "DAgger → APG → PPO" in page
     (legend,) = figure["made"].legends
-    assert [text.get_text() for text in legend.get_texts()] == ["DAgger → SHAC → PPO"]
+    assert [text.get_text() for text in legend.get_texts()] == ["DAgger → APG → PPO"]
 
 
 def test_no_two_films_share_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

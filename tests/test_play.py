@@ -93,7 +93,7 @@ def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
 
 
 def test_ghosts_get_the_same_start_and_the_same_pushes(play):
-    playground, alone = play(controller="shac", ghosts=["lqr"]), play()
+    playground, alone = play(controller="apg", ghosts=["lqr"]), play()
     for each in (playground, alone):
         each.push(3.0, -2.0)
         go(each, 0.5)
@@ -105,7 +105,7 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
 def test_controllers_change_without_a_jump(play):
     playground = play()
     go(playground, 0.5)
-    for name in ("shac", "nmpc", "lqr"):
+    for name in ("apg", "nmpc", "lqr"):
         before = playground.main.x
         playground.set_controller(name)
         playground.step()
@@ -232,10 +232,10 @@ class Lost:
 
 def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     monkeypatch.setitem(CONTROLLERS, "trajopt", Lost)
-    playground = play(controller="shac")
+    playground = play(controller="apg")
     with pytest.raises(PlanError, match="no way"):
         playground.set_controller("trajopt")
-    assert playground.main.name == "shac"  # the old one stays
+    assert playground.main.name == "apg"  # the old one stays
     playground = play(controller="trajopt")
     assert playground.main.name == "lqr"
     assert "LQR does instead: no way" in playground.notice

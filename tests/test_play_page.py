@@ -64,11 +64,11 @@ def visitor(opened):
 def test_controls_change_the_playground(opened, visitor):
     visitor.ask(MASSES, 40.0)
     visitor.ask("speed", 2.0)
-    visitor.ask("Controller", "shac")
+    visitor.ask("Controller", "apg")
     visitor.ask("Episode", "7")
     playground = opened.playground
     wait_for(lambda: playground.episode == 7)
-    assert (playground.plant["mass"], opened.page.speed, playground.main.name) == (40.0, 2.0, "shac")
+    assert (playground.plant["mass"], opened.page.speed, playground.main.name) == (40.0, 2.0, "apg")
     wait_for(lambda: visitor.value(MASSES) == 40.0)
     visitor.ask("Set all to 0")
     wait_for(lambda: playground.plant["mass"] == 0.0 == visitor.value(MASSES))
@@ -134,7 +134,7 @@ def test_a_pause_holds_everything(opened, visitor):
 
 REFUSED = [
     *(("Task", value) for value in ("<img src=x>", None, 3, ["orbit"], {"Task": 1})),
-    *(("Controller", value) for value in ("runs/secret/policy.json", "/etc/passwd", "shac.json", "nobody")),
+    *(("Controller", value) for value in ("runs/secret/policy.json", "/etc/passwd", "apg.json", "nobody")),
     *((MASSES, value) for value in (1e9, float("nan"), float("inf"), "5", True, None, 10**400)),
     *(("speed", value) for value in (0, -1, float("nan"), 1e9)),
     *(("playing", value) for value in (0, "yes", None)),
@@ -224,8 +224,8 @@ def test_in_the_browser_controls_ask_for_changes_and_show_them(opened, browser):
     wait_for(lambda: opened.playground.plant["mass"] == 20)
     browser.execute_script(change, "Set all to 0", True)
     wait_for(lambda: opened.playground.plant["mass"] == 0)
-    browser.execute_script(change, "shac", True)
-    wait_for(lambda: opened.playground.ghosts == ("shac",))
+    browser.execute_script(change, "apg", True)
+    wait_for(lambda: opened.playground.ghosts == ("apg",))
     browser.execute_script(change, "Task", "weave")
     wait_for(lambda: opened.playground.world.task_name == "weave")
     shown = "return [playground.stream.controls.get('Task').input.value, playground.moment.markers.length]"

@@ -162,7 +162,7 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng
 
 def test_a_policy_that_sees_more_than_the_present_is_refused():
     with pytest.raises(PolicyError, match="needs a history or its robot's parameters"):
-        engine_script([str(SHIPPED / "turn-shac-informed-unknown.json")])
+        engine_script([str(SHIPPED / "turn-apg-informed-unknown.json")])
 
 
 def test_a_function_with_an_unknown_operation_is_refused():
@@ -452,7 +452,7 @@ def test_somebody_drives_by_the_keys_of_a_keyboard_in_real_time_and_is_shown_a_r
     assert any(text.startswith("about ") for text in shown)
     assert re.fullmatch(r"regret \d+\.\d %", shown[-1])
     text = opened.find_element("css selector", ".text").text
-    assert text.startswith(f"You stood until the end, for 8.0 s: {shown[-1]}; SHAC policy: regret ")
+    assert text.startswith(f"You stood until the end, for 8.0 s: {shown[-1]}; APG policy: regret ")
     assert text.endswith("Link to this drive")
 
 

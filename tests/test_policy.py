@@ -102,7 +102,7 @@ def others_defaults():
     torch.set_default_dtype(torch.float32)
 
 
-@pytest.mark.parametrize(("name", "learner"), [("stabilize", "shac"), ("orbit", "sac"), ("weave", "dagger")])
+@pytest.mark.parametrize(("name", "learner"), [("stabilize", "apg"), ("orbit", "sac"), ("weave", "dagger")])
 def test_a_policy_computes_in_its_own_precision_whatever_torchs_default_is(name, learner, others_defaults):
     task = make_task(name)
     path = shipped_policies(task)[learner]

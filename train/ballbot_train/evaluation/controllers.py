@@ -39,10 +39,10 @@ def _filters(params: Robot) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ControllerName:
-    """What users write for a controller, and what it means: "shac-adaptive-ekf" is "shac" behind the filter "adaptive-ekf".
+    """What users write for a controller, and what it means: "apg-adaptive-ekf" is "apg" behind the filter "adaptive-ekf".
 
     Without its filter it is the name of an expert, in `CONTROLLERS` or `VARIANTS`, the name of a policy that comes with the
-    package ("shac"), or the path of a policy file, of a training run's folder, or of a model that Stable-Baselines3 saved.
+    package ("apg"), or the path of a policy file, of a training run's folder, or of a model that Stable-Baselines3 saved.
     """
 
     text: str

@@ -38,10 +38,10 @@ def file_part(name: str) -> str:
 
 
 def with_way(name: str, way: str) -> str:
-    """A controller's name behind the learners that came before it on the way of its training: "dagger → shac → ppo".
+    """A controller's name behind the learners that came before it on the way of its training: "dagger → apg → ppo".
 
     Args:
-        name: of a shipped policy, such as "ppo" or "shac-late". Any other name stays as it is if there is no way.
+        name: of a shipped policy, such as "ppo" or "apg-late". Any other name stays as it is if there is no way.
         way: its whole way, see `policy.files.shipped_ways`.
     """
     before, arrow, _ = way.rpartition(ARROW)

@@ -27,7 +27,7 @@ OBSERVATION_VERSION = 1
 SHIPPED = Path(__file__).parent.parent / "policies"
 """Policies that come with the package, as TASK-LEARNER.json and .safetensors, or TASK-ROBOT-LEARNER for other robots."""
 
-BEST = {"stabilize": "dagger", "turn": "shac", "orbit": "dagger", "weave": "shac"}
+BEST = {"stabilize": "apg", "turn": "apg", "orbit": "dagger", "weave": "apg"}
 """The learner of each task's shipped policy with the least mean regret, for the paper's robot."""
 
 _MOST_LAYERS = 64
@@ -244,13 +244,13 @@ class PolicyFile:
         return read
 
     def way(self) -> str:
-        """All learners and demonstrators of its training in turn, by its own record, for example "dagger → shac".
+        """All learners and demonstrators of its training in turn, by its own record, for example "dagger → apg".
 
         "" where the record holds no command of `ballbot train`.
         """
         training = self.read().get("training", {})
-        # "command" trains the policy again by today's options; "made_by" is the original command, if that differs
-        command = str(training.get("made_by") or training.get("command"))
+        # by today's names; "made_by" is the original command, if that differs
+        command = str(training.get("command"))
         names = re.findall(r"(?:ballbot train|--expert) (\w+)", command)
         return " → ".join(name for i, name in enumerate(names) if names[i - 1 : i] != [name])
 
@@ -314,7 +314,7 @@ def shipped_ways() -> Mapping[str, str]:
 def shipped_policies(task: Task, robot: str = PAPER, track: str | None = "") -> dict[str, Path]:
     """The policies of a task and robot that come with the package: the paths of their .json by the learner's name.
 
-    Those that were trained on a track, as "shac-late", are among them where that track is given, and all where it is None.
+    Those that were trained on a track, as "apg-late", are among them where that track is given, and all where it is None.
     """
     name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
     if name is None:

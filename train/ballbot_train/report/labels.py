@@ -15,7 +15,6 @@ _CONTROLLERS = {
     "ppo": ("PPO", "#2e8b57"),
     "sac": ("SAC", "#17a2b8"),
     "apg": ("APG", "#8e44ad"),
-    "shac": ("SHAC", "#8e44ad"),
     "ppo-scratch": ("PPO from scratch", "#9acd32"),
     "sac-scratch": ("SAC from scratch", "#7fd6e3"),
 }
