@@ -237,6 +237,21 @@ def test_a_filter_expects_no_less_noise_than_its_sensors_have():
     np.testing.assert_allclose(found[3:6], 0.09)
 
 
+def test_a_filter_of_a_robot_with_dry_friction_believes_the_gyroscope_across_the_axis_after_some_steps():
+    task, robot = make_task("stabilize", "omni"), replace(SAME, axle_friction=0.1)
+    usual, log = SensorFilter(task, SAME).reading_variance, {"gyro noise": 0.05}
+    controller = FilteredController(task, robot, "-ekf", LqrController(task, robot), log)
+    seen = BallbotEnv(task, "rk4", robot=robot, observation="sensors").reset(seed=0)[0]
+    controller.reset(0.0, seen, np.zeros(0))
+    noises = []
+    for k in range(201):
+        noises.append(controller.filter._noise.diagonal()[:3].copy())  # pyright: ignore[reportAttributeAccessIssue]
+        controller.act(0.02 * k, seen)
+    np.testing.assert_allclose(noises[0], 0.05**2)
+    np.testing.assert_allclose(noises[-1], [*usual[:2], 0.05**2], rtol=0.2)
+    np.testing.assert_allclose(SensorFilter(task, SAME, log).reading_variance[:3], 0.05**2)
+
+
 def test_a_filter_lets_the_force_of_each_wheel_jump_as_much_as_in_the_log():
     task, robot = make_task("stabilize", "omni"), replace(SAME, axle_friction=0.1)
     seen, spreads = BallbotEnv(task, "rk4", robot=robot, observation="sensors").reset(seed=0)[0], []
