@@ -78,6 +78,13 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way(monkeypat
     assert np.percentile(off, 90) < 0.1  # where the learner acts: feedback about it is linear
 
 
+def test_dagger_says_where_no_optimum_was_found(monkeypatch):
+    monkeypatch.setattr(dagger, "find_optima", lambda task, robot, x, *_, **__: [None] * len(x))
+    learner = dagger.Dagger(make_task("stabilize"), default_params(), TINY_DAGGER)
+    with pytest.raises(ValueError, match=r"nothing to learn from: .* of BallbotStabilize-v0 with the robot paper"):
+        learner.iterate()
+
+
 @pytest.mark.parametrize("name", ["turn", "weave"])
 def test_dagger_labels_what_it_meets(name, monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)

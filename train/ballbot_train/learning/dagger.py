@@ -229,6 +229,11 @@ class Dagger:
         rng = np.random.default_rng([self._seed, self.iteration])
         if self.iteration < config.gathering_iterations or not len(self._samples):
             figures = self._gather(rng)
+        if not len(self._samples):
+            raise ValueError(
+                f"there is nothing to learn from: no optimum was found in {config.episodes_per_iteration} episodes of "
+                f"{self._task.id} with the robot {registered_name(self._params)}; train with ppo or apg, or try more episodes"
+            )
         progress = self.iteration / config.iterations
         rate = schedules.cosine(config.learning_rate, _FINAL_LEARNING_RATE_FRACTION, progress)
         loss = self._fit.run(self._samples, config.gradient_steps, config.batch_size, rate, rng)
