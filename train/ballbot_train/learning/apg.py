@@ -112,6 +112,8 @@ class _Apg:
         self._batch.reset(seed=spawned(seed))
         self._step = self._control_step
         if long and not equations:  # else the batch compiles its part
+            # torch compiles this step for a few learners of a process only; earlier ones are compiled again if they go on
+            torch.compiler.reset()
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     @property
