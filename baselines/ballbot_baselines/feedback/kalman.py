@@ -226,7 +226,8 @@ class SensorFilter:
         self.model, (self._after, self._over_step) = _robot_and_sensors(params), _control_step(params, task.control_dt)
         samples = Sensors(params, task.control_dt).samples
         noise = [Sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [Sensors.ACCELEROMETER_NOISE**2 / samples] * 3
-        self.reading_variance = np.array([*noise, *[Sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        self._sensor_variance = np.array([*noise, *[Sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        self.reading_variance = self._sensor_variance.copy()
         self._bias = np.zeros(9)
         self._set_errors(errors or {})
         self._noise = np.diag(self.reading_variance)
@@ -316,7 +317,7 @@ class _DisturbanceFilter(SensorFilter):
         errors = errors or {}
         super().__init__(task, params, {name: each for name, each in errors.items() if not name.endswith(" drift")})
         self._first_noise = self._noise
-        self.reading_variance[:2] = SensorFilter(task, params).reading_variance[:2]
+        self.reading_variance[:2] = self._sensor_variance[:2]
         self._force = (_SHARE * params.force_limit) ** 2
         if {"speed drift", "lean rate drift"} <= set(errors):
             robot: Any = params
