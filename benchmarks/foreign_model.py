@@ -299,7 +299,7 @@ def summarize(rows: list[dict[str, Any]]) -> None:
         enough = [row for row in own if float(row["least torque"]) <= float(row["torque"])]
         print(
             f"{' '.join(filter(None, setting))}: {len(own)} seeds, {len(own) - len(standing)} fall, {at_rest(own)} rest, "
-            f"{ends}; {len(enough)} need at most this torque, of which {at_rest(enough)} rest"
+            f"{ends}; {at_rest(enough)} of the {len(enough)} that need at most this torque rest"
         )
 
 
