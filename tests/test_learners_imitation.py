@@ -118,6 +118,19 @@ def test_a_share_of_a_later_round_begins_where_the_learner_fails(hard, monkeypat
     assert failures() >= 64 * share + (1 - share) * random / 2
 
 
+def test_the_hardest_slaloms_are_those_in_which_the_learner_comes_nearest_to_an_obstacle():
+    task, rng = make_task("weave"), np.random.default_rng(0)
+    learner = dagger.make(task, default_params(), replace(TINY_DAGGER, symmetry="routes"))
+    x, c = map(np.array, zip(*(task.sample(rng, default_params()) for _ in range(64)), strict=True))
+    c[:20] = task.without_obstacles(c[0])
+    order = learner._hardest(x, c, 1.0)
+    ran = fresh.run_policy(learner.network, replace(task, duration=1.0), x, c, np.zeros((64, 0)))
+    failures = int(ran.failure.sum())
+    assert 0 < failures < 44
+    assert ran.failure[torch.as_tensor(order[:failures])].all()
+    assert (np.diff(ran.margin.numpy()[order[failures:]]) >= 0).all()
+
+
 @pytest.mark.parametrize("squash", ["tanh", "clip"])
 @pytest.mark.parametrize(
     ("name", "symmetry"), [("stabilize", "odd"), ("orbit", "centred"), ("turn", "frame"), ("weave", "routes")]

@@ -63,6 +63,7 @@ def test_episodes_of_a_policy_carry_no_gradient():
     assert not run.cost.requires_grad
     assert run.success.all()
     assert run.steps.tolist() == [5, 5]
+    assert run.margin.numpy() == pytest.approx(1 - np.cos(task.max_tilt), abs=1e-6)  # upright
 
 
 def test_episodes_of_a_policy_in_machine_code_are_those_in_torch(task, rng):

@@ -1,5 +1,6 @@
 """Episodes of a policy in a `BallbotBatch` or a `BallbotArrays`: one of each environment, all at once."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -29,6 +30,8 @@ class BatchEpisodes(NamedTuple):
     """(B,) int64, control steps taken."""
     goal_error: torch.Tensor
     """(B,) how far from the goal the episode ended, in units of the goal's tolerances; see `Task.goal_error`."""
+    margin: torch.Tensor
+    """(B,) the least of the `Task.margins` that the episode had, which are negative where a limit is violated."""
 
 
 @torch.no_grad()
@@ -56,8 +59,9 @@ def run_episodes(
     steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=device)
     violated = torch.full_like(steps, -1)
     assert batch.state is not None
-    end, constants = torch.as_tensor(batch.state.x), torch.as_tensor(batch.state.c)
-    for _ in range(batch.task.steps):
+    task, end, constants = batch.task, torch.as_tensor(batch.state.x), torch.as_tensor(batch.state.c).unbind(0)
+    margin, c_end = torch.full_like(end[0], torch.inf), constants
+    for _ in range(task.steps):
         result = _stepped(batch, policy(observation))
         observation = result.observation
         cost += torch.where(running, result.cost, 0.0)
@@ -65,12 +69,13 @@ def run_episodes(
         success |= running & result.success
         violated = torch.where(running & result.failure, result.violated, violated)
         end = torch.where(running, result.x, end)
+        c_end = task.at(constants, steps.to(end.dtype) * task.control_dt)
+        margin = functools.reduce(torch.minimum, task.margins(end.unbind(0), c_end), margin)
         running &= ~result.ended
         if not running.any():
             break
-    c_end = batch.task.at(constants.unbind(0), steps.to(end.dtype) * batch.task.control_dt)
-    goal_error = batch.task.goal_error(end.unbind(0), c_end)
-    return BatchEpisodes(cost, success, violated >= 0, violated, steps, goal_error)
+    goal_error = task.goal_error(end.unbind(0), c_end)
+    return BatchEpisodes(cost, success, violated >= 0, violated, steps, goal_error, margin)
 
 
 class _Stepped(NamedTuple):

@@ -16,7 +16,8 @@ Where a learner decides first on which sides it passes obstacles, the optima are
 
 A share of the episodes begins where the learner fails or pays most, because failures are at the edge of what can be recovered
 from. Where these show within seconds, very many starts are tried, because failures become rare, and the hardest of them again
-in later iterations. On a track the expert has access to each episode's robot. The learner gets observations alone.
+in later iterations. In slaloms those starts are the hardest from which the learner touches an obstacle or comes nearest to
+one. On a track the expert has access to each episode's robot. The learner gets observations alone.
 """
 
 import itertools
@@ -80,8 +81,9 @@ TUNED: dict[str, DaggerConfig] = {
     "orbit": replace(_FEW, gathering_iterations=3, symmetry="centred"),
     "weave": replace(
         _FEW,
-        gathering_iterations=5,
-        gradient_steps=3000,
+        gathering_iterations=8,
+        episodes_per_iteration=256,
+        gradient_steps=2500,
         learning_rate=5e-3,
         hidden=(128, 128),
         symmetry="routes",
@@ -103,7 +105,7 @@ _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3])
 _SAME_WAY = 1.5  # m between two ways that are the same
 # of an iteration's episodes; how many are drawn for each of these, and for how many seconds at most these are tried; of the
 # hardest so far, for each of these in each iteration, how many are tried again
-_HARD, _HARD_OF_MANY = (0.25, 16, math.inf, 0), (0.5, 256, 2.0, 4)
+_HARD, _HARD_OF_MANY, _HARD_SLALOMS = (0.25, 16, math.inf, 0), (0.5, 256, 2.0, 4), (0.5, 128, 3.4, 4)
 _TOGETHER = 4096  # starts that are tried at once
 _LARGE = 0.1  # error of an action
 _ROBOTS = 16  # of an iteration on a track
@@ -210,8 +212,8 @@ class Dagger:
         """Whether samples label the states around them too; see the top of this file."""
         alone = self._around and task.routed_frame is None
         # a robot that is to come to rest shows within seconds whether it can
-        rests = alone and equilibrium_gain(task, params) is not None
-        self._hard = _HARD_OF_MANY if rests else _HARD
+        rests = self._around and equilibrium_gain(task, params) is not None
+        self._hard = (_HARD_OF_MANY if alone else _HARD_SLALOMS) if rests else _HARD
         self._tried = np.zeros((0, params.state_size)), np.zeros((0, len(task.constant_names)))
         """Initial states and constants of the hardest starts of earlier iterations."""
         # slopes are fitted best by smooth layers, and labels at the limits by a clip; with routes, it touched more obstacles
@@ -281,7 +283,8 @@ class Dagger:
 
     def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Initial states (count, 8) and constants (count, nc). As far as there are some, a share are the hardest
-        of many: those in which the learner does not succeed, and then those that cost it most.
+        of many: those in which the learner does not succeed, and then those that cost it most; or, where it has routes, those
+        in which it comes nearest to an obstacle.
         """
         share, among, seconds, again = self._hard
         hard = round(share * count) if self.iteration else 0
@@ -305,13 +308,14 @@ class Dagger:
         shorter = task.control_dt * math.ceil(min(seconds, task.duration) / task.control_dt)
         whole = shorter >= task.duration
         tried = task if whole else replace(task, duration=shorter)
-        bad, costs = [], []
+        bad, ease = [], []
         for first in range(0, len(x), _TOGETHER):
             some = slice(first, first + _TOGETHER)
             ran = fresh.run_policy(self.network, tried, x[some], c[some], np.zeros((len(x[some]), 0)), robot)
             bad.append(~ran.success if whole else ran.failure)
-            costs.append(ran.cost)
-        return np.lexsort((-torch.cat(costs).numpy(), ~torch.cat(bad).numpy()))
+            # what a slalom costs depends on its length above all
+            ease.append(-ran.cost if self.network.routes is None else ran.margin)
+        return np.lexsort((torch.cat(ease).numpy(), ~torch.cat(bad).numpy()))
 
     def _labelled_run(
         self,

@@ -23,6 +23,7 @@ EPISODES = 60_000
 _DISTANCES = 7  # for which the motion without obstacles is found
 _STEPS, _BATCH, _RATE = 6000, 1024, 3e-3
 _TOLERANCE = 0.004  # choices whose costs differ by less, relative to the episode's, are about as good
+_BAD = 50.0  # price of a regret of 1: it keeps the network from the few choices that are far worse than the best
 
 
 def fit_routes(
@@ -48,7 +49,9 @@ def fit_routes(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
     for _ in range(_STEPS):
         drawn = torch.randint(kept, EPISODES, (_BATCH,), generator=generator)
-        loss = torch.nn.functional.cross_entropy(routes.mlp(layouts[drawn]), wanted[drawn])
+        outputs = routes.mlp(layouts[drawn])
+        regret = (outputs.softmax(-1) * costs[drawn].clamp(max=1.0)).sum(-1).mean()
+        loss = torch.nn.functional.cross_entropy(outputs, wanted[drawn]) + _BAD * regret
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
