@@ -124,7 +124,7 @@ def test_the_hardest_slaloms_are_those_in_which_the_learner_comes_nearest_to_an_
     x, c = map(np.array, zip(*(task.sample(rng, default_params()) for _ in range(64)), strict=True))
     c[:20] = task.without_obstacles(c[0])
     order = learner._hardest(x, c, 1.0)
-    ran = fresh.run_policy(learner.network, replace(task, duration=1.0), x, c, np.zeros((64, 0)))
+    ran = fresh.run_policy(learner.network, replace(task, duration=1.0), x, c, np.zeros((64, 0)), margins=True)
     failures = int(ran.failure.sum())
     assert 0 < failures < 44
     assert ran.failure[torch.as_tensor(order[:failures])].all()

@@ -58,7 +58,11 @@ def test_episodes_of_a_policy_carry_no_gradient():
     task = TASKS["stabilize"](duration=0.1)
     weights = torch.zeros(8, 2, requires_grad=True)
     run = run_episodes(
-        BallbotBatch(task, 2, compile=False), lambda seen: seen @ weights, np.zeros((2, 8)), np.zeros((2, 0))
+        BallbotBatch(task, 2, compile=False),
+        lambda seen: seen @ weights,
+        np.zeros((2, 8)),
+        np.zeros((2, 0)),
+        margins=True,
     )
     assert not run.cost.requires_grad
     assert run.success.all()
@@ -74,7 +78,7 @@ def test_episodes_of_a_policy_in_machine_code_are_those_in_torch(task, rng):
     x, c = (np.array(part, float).reshape(8, -1) for part in zip(*starts, strict=True))
     weights = torch.from_numpy(rng.normal(size=(task.observation_size(params), 2)).astype(np.float32))
     runs = [
-        run_episodes(batch, lambda seen: (3 * seen.float() @ weights).clamp(-1, 1), x, c)
+        run_episodes(batch, lambda seen: (3 * seen.float() @ weights).clamp(-1, 1), x, c, margins=True)
         for batch in (
             BallbotBatch(task, 8, compile=False, dtype=torch.float64),
             BallbotNative(task, 8, np.float64, params),

@@ -278,6 +278,7 @@ def run_policy(
     robot: str = PAPER,
     randomization: Randomization = Randomization(),
     dtype: torch.dtype = torch.float32,
+    margins: bool = False,
 ) -> BatchEpisodes:
     """Runs B episodes under a policy, all at once in the batched closed-form model.
 
@@ -292,6 +293,7 @@ def run_policy(
         robot: by name.
         randomization: what varies.
         dtype: in which the model computes.
+        margins: same as for `run_episodes`.
 
     Raises:
         ValueError: nothing of that name, or a controller that does not run in the batch.
@@ -303,7 +305,7 @@ def run_policy(
     acts = isinstance(policy, ActionController) or callable(policy)
     plain = acts and not world["history"] and randomization == Randomization()
     batch: Any = make_envs(len(x), task, plain, dtype=dtype, robot=robot, **world).batch
-    return run_episodes(batch, _act(policy, batch), x, c, drawn=drawn if drawn.shape[1] else None)
+    return run_episodes(batch, _act(policy, batch), x, c, drawn if drawn.shape[1] else None, margins)
 
 
 def make_envs(num_envs: int, task: Task, plain: bool, **settings: Any) -> BallbotVectorEnv:

@@ -308,13 +308,14 @@ class Dagger:
         shorter = task.control_dt * math.ceil(min(seconds, task.duration) / task.control_dt)
         whole = shorter >= task.duration
         tried = task if whole else replace(task, duration=shorter)
-        bad, ease = [], []
+        bad, ease, slalom = [], [], self.network.routes is not None
         for first in range(0, len(x), _TOGETHER):
             some = slice(first, first + _TOGETHER)
-            ran = fresh.run_policy(self.network, tried, x[some], c[some], np.zeros((len(x[some]), 0)), robot)
+            world: dict[str, Any] = {"drawn": np.zeros((len(x[some]), 0)), "robot": robot, "margins": slalom}
+            ran = fresh.run_policy(self.network, tried, x[some], c[some], **world)
             bad.append(~ran.success if whole else ran.failure)
             # what a slalom costs depends on its length above all
-            ease.append(-ran.cost if self.network.routes is None else ran.margin)
+            ease.append(ran.margin if slalom else -ran.cost)
         return np.lexsort((torch.cat(ease).numpy(), ~torch.cat(bad).numpy()))
 
     def _labelled_run(
