@@ -18,6 +18,7 @@ from ballbot_train.policy.files import shipped_policies
 from ballbot_train.report import figures
 from ballbot_train.report.labels import labels
 from ballbot_train.report.replay import Replay, Take
+from ballbot_train.work.executors import Workers
 
 made_by = figures.regret_figure
 TAKE = Take("", Trajectory(np.arange(2.0), np.zeros((2, 8)), np.zeros((1, 2))), "k")
@@ -103,6 +104,7 @@ def test_two_files_of_one_name_have_rows_and_recordings_of_their_own(
     two_policies: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
+    monkeypatch.setattr(Workers, "here", 1)  # and so in this process
     monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
     benchmark(["stabilize"], two_policies, episodes=1, physics="rk4", out=out)
     text = (out / "leaderboard.md").read_text()
