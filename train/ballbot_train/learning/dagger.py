@@ -311,8 +311,8 @@ class Dagger:
         bad, ease, slalom = [], [], self.network.routes is not None
         for first in range(0, len(x), _TOGETHER):
             some = slice(first, first + _TOGETHER)
-            world: dict[str, Any] = {"drawn": np.zeros((len(x[some]), 0)), "robot": robot, "margins": slalom}
-            ran = fresh.run_policy(self.network, tried, x[some], c[some], **world)
+            drawn = np.zeros((len(x[some]), 0))
+            ran = fresh.run_policy(self.network, tried, x[some], c[some], drawn, robot, margins=slalom)
             bad.append(~ran.success if whole else ran.failure)
             # what a slalom costs depends on its length above all
             ease.append(ran.margin if slalom else -ran.cost)
