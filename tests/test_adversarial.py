@@ -100,7 +100,8 @@ def test_a_task_that_samples_in_its_own_way_and_hidden_parameters_are_refused():
 
 def test_the_command_writes_the_starts_and_motions_that_replay_shows(typed, tmp_path, monkeypatch):
     monkeypatch.setattr(adversarial, "hard_starts", partial(hard_starts, rounds=2))
-    monkeypatch.setattr(adversarial, "_CHECKED", 0)  # other tests search these optima twice
+    monkeypatch.setattr(adversarial, "_CLIMBS", 0)  # other tests climb,
+    monkeypatch.setattr(adversarial, "_CHECKED", 0)  # and search these optima twice
     code, said = typed(
         *("evaluate", "apg", "--task", "stabilize", "--fresh", "2", "--optima", "0"),
         *("--adversarial", "--workers", "1", "--out", str(tmp_path)),

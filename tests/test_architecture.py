@@ -28,16 +28,22 @@ ROOMS = (
 
 
 @functools.cache
-def modules(path, only_top_level=False):
-    """Dotted names that the import statements of a file name, anywhere in it or at its top level only.
-
-    `from a import b` counts as a.b, because b may be a module. Imports for type checkers never run and do not count.
-    """
+def parsed(path):
+    """The syntax tree of a file, without what runs for type checkers alone."""
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
             node.body = []
-    found = set()
+    return tree
+
+
+@functools.cache
+def modules(path, only_top_level):
+    """Dotted names that the import statements of a file name, anywhere in it or at its top level only.
+
+    `from a import b` counts as a.b, because b may be a module.
+    """
+    tree, found = parsed(path), set()
     for node in tree.body if only_top_level else ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -49,7 +55,7 @@ def modules(path, only_top_level=False):
 
 def imports(path, only_top_level=False):
     """Names of the packages that a file imports, anywhere or at its top level."""
-    return {name.partition(".")[0] for name in modules(path, only_top_level)}
+    return {name.partition(".")[0] for name in modules(path, only_top_level=only_top_level)}
 
 
 def package(path):
@@ -83,7 +89,7 @@ def test_imports_go_down():
     upwards = [
         f"{path.relative_to(ROOT)} ({room_of(path)}) imports {name} from a room above it"
         for path in FILES
-        for name in modules(path)
+        for name in modules(path, only_top_level=False)
         if room(name) and ROOMS.index(room(name)) > ROOMS.index(room_of(path))
     ]
     assert upwards == []
@@ -124,7 +130,7 @@ def test_importing_the_environments_imports_only_numpy_and_gymnasium():
 def test_no_default_reads_a_urdf_when_its_module_is_imported():
     def early_calls(path):
         """Calls outside of functions' bodies, where they run at import: at the top, in classes and in defaults."""
-        waiting = [ast.parse(path.read_text())]
+        waiting: list[ast.AST] = [parsed(path)]
         while waiting:
             node = waiting.pop()
             if isinstance(node, ast.Call):
@@ -164,7 +170,7 @@ def test_the_cubic_hermite_basis_and_the_angle_of_tilt_each_have_one_place():
 
 def test_no_file_prints_but_the_command_line():
     def prints(path):
-        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        calls = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
         return any(isinstance(call.func, ast.Name) and call.func.id == "print" for call in calls)
 
     library = [path for path in FILES if package(path) != "ballbot_train"]

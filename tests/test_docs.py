@@ -88,6 +88,7 @@ def test_commands_run(page, typed, monkeypatch):
     few = lambda result, count, workers: optima(result, min(count, 2), workers)  # noqa: E731
     monkeypatch.setattr(fresh.FreshResult, "with_optima", few)
     monkeypatch.setattr(adversarial, "hard_starts", partial(adversarial.hard_starts, rounds=1))
+    monkeypatch.setattr(adversarial, "_CLIMBS", 0)
     monkeypatch.setattr(adversarial, "_CHECKED", 0)
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():

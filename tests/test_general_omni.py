@@ -12,7 +12,7 @@ from ballbot_baselines.feedback.kalman import SensorFilter
 from ballbot_baselines.identification.estimate import Problem
 from ballbot_baselines.identification.likelihood import Innovations
 from ballbot_baselines.identification.record import record
-from ballbot_gym import BallbotEnv, GeneralOmni, Randomization, named_robot, read_urdf
+from ballbot_gym import BallbotEnv, GeneralOmni, Randomization, named_robot, read_urdf, rollout
 from ballbot_gym.engines import installed_physics, make_simulator
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Omni, urdf_text
@@ -135,10 +135,9 @@ def test_lqr_brings_it_to_rest_despite_dry_friction():
     robot = replace(SAME, com_x=0.01, com_y=-0.005, axle_friction=0.3)
     controller = LqrController(task, robot)
     x = robot.rest() + np.array([0.3, -0.2, 0.04, 0.02, *[0.0] * 7])
-    controller.reset(0.0, x, np.zeros(0))
-    for k in range(400):
-        x = robot.step(x, np.clip(controller.act(0.02 * k, x), -robot.force_limit, robot.force_limit), 0.02, 4)
-    np.testing.assert_allclose(x[:2], 0.0, atol=0.01)
+    run = rollout(BallbotEnv(task, "rk4", robot=robot), controller, options={"state": x})
+    assert len(run.trajectory.u) == 400
+    np.testing.assert_allclose(run.trajectory.x[-1, :2], 0.0, atol=0.01)
 
 
 def test_identification_estimates_what_the_usual_robot_does_not_have():

@@ -24,12 +24,18 @@ MASSES = "error of both masses, %"
 STANDING = 3  # a certified episode of Stabilize in which LQR comes to rest
 
 
+@pytest.fixture(scope="module")
+def live():
+    """The page, which is the same for every playground."""
+    return playground_page(live=True)
+
+
 class Opened:
     """A page with a loop that runs in a thread of its own."""
 
-    def __init__(self):
+    def __init__(self, live):
         self.playground = Playground(controller="lqr", physics="rk4", episode=STANDING)
-        self.viewer = Viewer(0, playground_page(live=True))
+        self.viewer = Viewer(0, live)
         self.port = self.viewer.port
         self.page = PlayPage(self.playground, self.viewer)
         self.thread = threading.Thread(target=self.page.run, daemon=True)
@@ -49,8 +55,8 @@ class Opened:
 
 
 @pytest.fixture
-def opened():
-    page = Opened()
+def opened(live):
+    page = Opened(live)
     yield page
     page.close()
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from ballbot_gym import certified
+from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.robot import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.vector.arrays import BallbotArrays
+from ballbot_gym.vector.native import BallbotNative
 
 torch = pytest.importorskip("torch")
 
@@ -62,7 +64,11 @@ def play(task):
     """`Played` by name of policy. All policies act in one batch."""
     params = default_params()
     chosen, rng = policies(task, params), np.random.default_rng(0)
-    envs = BallbotArrays(task, ENVS * len(chosen), np.float64, params)
+    count = ENVS * len(chosen)
+    try:
+        envs = BallbotNative(task, count, np.float64, params)
+    except NoMachineCodeError:  # then it takes longer
+        envs = BallbotArrays(task, count, np.float64, params)
     parts = [slice(i * ENVS, (i + 1) * ENVS) for i in range(len(chosen))]
     envs.state = envs.initial_state(seed=0)
     observation = envs.observe(envs.state)

@@ -24,7 +24,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.train import Run, command_line, train
-from ballbot_train.learning import apg, training
+from ballbot_train.learning import apg, dagger, training
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.files import SHIPPED
@@ -289,6 +289,7 @@ SMALL = {
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_task_that_no_learner_knows_trains_with_default_settings(learner, monkeypatch):
     monkeypatch.setitem(TASKS, "stand", Stand)
+    monkeypatch.setattr(dagger, "_SECONDS", 0.5)
     algorithm, module = LEARNERS[learner], importlib.import_module(LEARNERS[learner].module)
     settings = algorithm.settings("stand")
     assert settings == module.TUNED[""]
