@@ -23,7 +23,7 @@ from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.paths import sides_passed
 from ballbot_gym.tasks.stabilize import Stabilize
 
-COUNT, ALONE = 12, 6  # drawn episodes, and how many of them are searched one by one too
+COUNT, ALONE = 12, 4  # drawn episodes, and how many of them are searched one by one too
 NO_CONSTANTS = np.zeros(0)
 FALLEN = np.array([0, 0, 1.3, 0, 0, 0, 5.0, 0])
 

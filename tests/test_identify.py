@@ -255,10 +255,11 @@ def test_the_search_converges_at_a_delay_of_0_where_a_command_was_guessed(record
 
 def test_glitches_in_commands_do_not_move_the_delay(recorded: Recorded, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    commands = recorded.readings.commands.copy()
+    readings = recorded.readings.between(0, 1000)
+    commands = readings.commands.copy()
     hit = rng.random(commands.shape) < 0.01
     commands[hit] += 100 * rng.choice([-1, 1], hit.sum())
-    log = written(replace(recorded.readings, commands=commands), tmp_path).readings
+    log = written(replace(readings, commands=commands), tmp_path).readings
     problem = Problem(ROBOT, log.names, KNOWN)
     found = {each.parameter.name: each.value for each in problem.most_likely([log]).estimates}
     assert found["delay"] == pytest.approx(recorded.delay, abs=0.003)
@@ -506,10 +507,10 @@ def test_the_regret_of_the_controller_is_that_of_parts_of_a_log_that_end_at_rest
 
 def test_the_regret_of_a_drive_does_not_depend_on_the_heading_that_the_robot_keeps(interpreted: None) -> None:
     def motion(t: float) -> np.ndarray:
-        return np.array([0.4 * (t >= 3.0), 0.0, 0.4])
+        return np.array([0.4 * (t >= 2.0), 0.0, 0.4])
 
     omni: Any = named_robot("omni")
-    made = record(omni, 9.0, motion, None, "rk4")
+    made = record(omni, 7.0, motion, None, "rk4")
     assert made.trajectory.x[-1, 8] == pytest.approx(0.4, abs=0.01)
     problem = Problem(omni, made.readings.names, KNOWN)
     z = np.zeros(len(problem.parameters))

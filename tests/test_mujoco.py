@@ -39,7 +39,7 @@ def test_in_grip_it_follows_the_closed_form(name, rng):
     robot = named_robot(name)
     simulator = make_simulator("mujoco", robot, 0.02)
     errors = []
-    for _ in range(20):
+    for _ in range(12):
         states, forces = drawn(robot, rng)
         simulator.reset(tuple(states[0]))
         end = [simulator.step(u) for u in forces][-1]

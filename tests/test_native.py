@@ -132,9 +132,10 @@ def test_an_action_that_is_not_finite_changes_nothing(count):
 @needs_compiler
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
 def test_a_forked_process_has_threads_of_its_own():
-    """In a process of its own, because this one may have threads that hold locks."""
+    """In a process of its own, because this one may have threads that hold locks. It needs no torch."""
     code = """
-import numpy as np, os
+import numpy as np, os, sys
+sys.modules["torch"] = None
 from ballbot_gym.vector import native
 from ballbot_gym.vector import BallbotVectorEnv
 native._PARALLEL_FROM = 64
