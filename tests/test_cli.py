@@ -18,6 +18,7 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train import cli
 from ballbot_train.commands import COMMANDS, RESUMABLE
 from ballbot_train.commands.certify import certify
+from ballbot_train.work.executors import Workers
 
 
 def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_path, typed):
@@ -96,6 +97,8 @@ WRITTEN = {"episodes.csv", "figures", "robustness.csv", "robustness.json", "robu
     ],
 )
 def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, how, tmp_path, typed, monkeypatch):
+    monkeypatch.setattr(Workers, "here", 1)  # and so in this process
+
     def interrupt(*_):
         raise KeyboardInterrupt
 

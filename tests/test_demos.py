@@ -22,6 +22,7 @@ from ballbot_train.learning.datasets import command_of, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, Expert, write_demos
 from ballbot_train.policy.files import shipped_policies
 from ballbot_train.policy.network import load_policy
+from ballbot_train.work.executors import Workers
 
 
 def make(out, **changes):
@@ -138,6 +139,7 @@ def test_its_command_makes_it_anew(dataset, tmp_path, monkeypatch):
     assert made == dataset
     words[words.index("--out") + 1] = str(tmp_path / "again-v0")
     monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(Workers, "here", 1)  # and so in this process
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0
