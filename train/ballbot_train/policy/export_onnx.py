@@ -48,8 +48,9 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
         RuntimeError: the ONNX graph acts differently from the policy.
     """
     network = PolicyNetwork.load(policy, task, robot).eval()
+    about = PolicyFile(policy).metadata(task, robot)  # first, because it refuses policies that cannot be exported
     model = _traced(network)
-    for name, value in PolicyFile(policy).metadata(task, robot).items():
+    for name, value in about.items():
         entry = model.metadata_props.add()
         entry.key, entry.value = name, value
     _check(model, network)
