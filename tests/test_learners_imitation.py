@@ -271,7 +271,7 @@ def test_dagger_falls_far_less_than_lqr_after_two_rounds():
         "iterations": 4,
         "gathering_iterations": 2,
         "episodes_per_iteration": 64,
-        "gradient_steps": 600,
+        "gradient_steps": 400,
         "batch_size": 256,
         "hidden": (64,),
         "symmetry": "odd",
