@@ -152,7 +152,7 @@ def printed(name: str, problem: tuple[Any, ...], kinds: tuple[type, ...], source
     if not all(kind.__module__.startswith(f"{_PACKAGE.name}.") for kind in kinds):
         return source()
     content = [_fields(part) if dataclasses.is_dataclass(part) else repr(part) for part in problem]
-    key = hashlib.sha256("\0".join([_state_of_package(), *content]).encode()).hexdigest()[:_DIGITS]
+    key = hashlib.sha256("\0".join([_digest_of_package(), *content]).encode()).hexdigest()[:_DIGITS]
     try:
         path = cache_folder() / f"{name}-{key}.c"
         if path.is_file():
@@ -174,11 +174,14 @@ def _fields(part: Any) -> str:
 
 
 @cache
-def _state_of_package() -> str:
-    """When the files of this package were written last, ns, and how long they are."""
-    found = (path for path in _PACKAGE.rglob("*") if path.suffix in (".py", ".c", ".h"))
-    states = ((path, path.stat()) for path in sorted(found))
-    return "\0".join(f"{path} {state.st_mtime_ns} {state.st_size}" for path, state in states)
+def _digest_of_package() -> str:
+    """A digest of the files of this package, so that every copy of it prints the same code once."""
+    found = sorted(path for path in _PACKAGE.rglob("*") if path.suffix in (".py", ".c", ".h"))
+    digest = hashlib.sha256()
+    for path in found:
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(_PACKAGE).as_posix()} {len(content)}\0".encode() + content)
+    return digest.hexdigest()
 
 
 def cache_folder() -> Path:
