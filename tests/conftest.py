@@ -78,7 +78,6 @@ def interpreted(monkeypatch):
         pytest.importorskip(f"ballbot_baselines.solvers.{name}") for name in ("compiled", "nlp", "shooting")
     )
     monkeypatch.setattr(compiled, "_loaded", lambda *_: None)
-    monkeypatch.setattr(compiled.codegen, "in_lanes", lambda *_: "")  # nobody compiles it
     monkeypatch.setattr(nlp, "_dynamics_made", {})
     for name in ("ocp_of", "_solver"):
         monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))

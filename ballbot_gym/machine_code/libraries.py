@@ -141,12 +141,13 @@ def printed(name: str, problem: tuple[Any, ...], kinds: tuple[type, ...], source
     """The C code that `source` prints.
 
     For tasks and robots of this package it is kept in the cache, because CasADi prints it, whose import takes longer than a
-    hundred control steps. Those of users may change in ways that cannot be seen without printing.
+    hundred control steps, and printing takes longer still. Those of users may change in ways that cannot be seen without
+    printing.
 
     Args:
         name: what the code is called, for humans who look into the cache.
         problem: everything that determines the code, besides the files of this package. Of dataclasses, all fields count.
-        kinds: the classes of task and robot.
+        kinds: the classes of task and robot; () where `problem` holds all that is printed.
         source: prints the code; it may raise any error.
     """
     if not all(kind.__module__.startswith(f"{_PACKAGE.name}.") for kind in kinds):
