@@ -202,6 +202,7 @@ def test_table_terminal_report_and_figure_show_the_whole_way(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figure = {}
+    monkeypatch.setattr(Workers, "here", 1)  # and so in this process
     monkeypatch.setattr(figures, "regret_figure", lambda *given: figure.setdefault("made", made_by(*given)))
     benchmark(["stabilize"], ["ppo"], episodes=1, physics="rk4", out=tmp_path)
     way = "dagger → apg → ppo"
