@@ -98,6 +98,20 @@ def test_functions_are_compiled_once_and_then_read_from_the_cache(folder, monkey
 
 
 @needs_compiler
+def test_the_code_of_lanes_is_printed_once_and_then_read_from_the_cache(folder, monkeypatch):
+    compiled.in_lanes("powers", powers())
+    assert sorted(path.suffix for path in folder.iterdir()) == [".c", libraries.SUFFIX]
+    printed = []
+    real = codegen.in_lanes
+    monkeypatch.setattr(codegen, "in_lanes", lambda *given: printed.append(given) or real(*given))
+    x = np.full((1, compiled.LANES), 3.0)
+    for factor, times in ((1.0, 0), (2.0, 1)):  # another function is printed
+        square, cube = compiled.in_lanes("powers", powers(factor))
+        assert (float(square(x)[0]), float(cube(x)[0])) == (9.0 * factor, 27.0)
+        assert len(printed) == times
+
+
+@needs_compiler
 def test_library_depends_on_processor_and_content(folder, monkeypatch):
     compiled.compiled("powers", powers())
     compiled.compiled("powers", powers(2.0))

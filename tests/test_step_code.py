@@ -1,5 +1,6 @@
 """Machine code of single environments computes what Python computes, to rounding, and the same bits every time."""
 
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -253,3 +254,13 @@ def test_code_of_this_package_is_printed_once_on_a_machine_and_that_of_users_by_
     assert printed == "True"
     assert other != reward
     assert [reward_and_print("own") for _ in range(2)] == [[reward, "True"]] * 2
+
+
+def test_copies_of_this_package_share_its_printed_code_until_a_file_changes(monkeypatch, tmp_path):
+    digest = libraries._digest_of_package.__wrapped__
+    own = digest()
+    copy = shutil.copytree(libraries._PACKAGE, tmp_path / "ballbot_gym", copy_function=shutil.copyfile)
+    monkeypatch.setattr(libraries, "_PACKAGE", copy)
+    assert digest() == own
+    (copy / "ops.py").write_text((copy / "ops.py").read_text() + "\n")
+    assert digest() != own
