@@ -60,9 +60,9 @@ def in_lanes(
     lanes = f"{name}-lanes"
 
     def source() -> str:
-        # printing takes a third of the time in which a first optimum is found, and a tenth of that to tell functions apart
-        told = LANES, *(function.serialize() for function in functions)
-        return machine_code.printed(lanes, told, (), lambda: codegen.in_lanes(functions, LANES))
+        # printing takes a third of the time in which a first optimum is found, and serializing a tenth of that
+        problem = LANES, *(function.serialize() for function in functions)
+        return machine_code.printed(lanes, problem, (), lambda: codegen.in_lanes(functions, LANES))
 
     try:
         found = _loaded(lanes, source, functions, flags)
