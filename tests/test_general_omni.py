@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballbot_baselines import LqrController
+from ballbot_baselines import LqrController, NmpcController
 from ballbot_baselines.feedback.adaptive import FilteredController
 from ballbot_baselines.feedback.kalman import SensorFilter
 from ballbot_baselines.identification.estimate import Problem
@@ -190,6 +190,17 @@ def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_
     for k in range(400):
         seen, *_, info = env.step(controller.act(0.02 * k, seen) / known.force_limit)
     np.testing.assert_allclose(info["state"][:2], 0.0, atol=0.05)
+
+
+def test_nmpc_plans_without_dry_friction_and_overcomes_it():
+    task, robot = make_task("stabilize", "omni"), replace(SAME, axle_friction=0.3)
+    x, forces = np.array([0.3, -0.2, 0.03, 0.02, 0.1, *[0.0] * 6]), []
+    for model in (robot, robot.without_dry_friction()):
+        nmpc = NmpcController(task, model)
+        nmpc.reset(0.0, x, np.zeros(0))
+        forces.append(nmpc.act(0.0, x))
+    np.testing.assert_allclose(forces[0], robot.overcoming(x, forces[1], task.control_dt))
+    assert np.abs(forces[0] - forces[1]).max() > 1.0
 
 
 def test_forces_that_a_log_took_for_drifts_do_not_hide_the_lean():

@@ -19,6 +19,9 @@ with the multipliers of the last program. Without it the iteration diverges alon
 measured and the predicted accelerations is fitted by recursive least squares, and added to the model over the horizon. As in
 Pannocchia and Rawlings, "Disturbance models for offset-free model-predictive control" (2003), there is a constant
 disturbance. Errors of masses and lengths are proportional to lean and force, so those are fitted as well.
+
+The model has no dry friction, and the force that overcomes it is added, as LQR does. Friction that changes its sign with a
+speed is far from linear there: with it in the model, the iteration diverges if a state is estimated and the torque is short.
 """
 
 from dataclasses import dataclass
@@ -100,7 +103,8 @@ class NmpcController:
         Raises:
             ValueError: the horizon is not a whole number of control steps, or has fewer than 2.
         """
-        self._task, self._params = task, params
+        self._task = task
+        self.adapt(params)
         self.backoff = backoff or (_OFFSET_FREE_BACKOFF if offset_free else BACKOFF)
         self._iterations, self._offset_free = iterations, offset_free
         if horizon is None:
@@ -124,7 +128,7 @@ class NmpcController:
 
     def adapt(self, params: Robot) -> None:
         """Continues with the model of another robot of the same kind. The plan stays."""
-        self._params = params
+        self._robot, self._params = params, params.without_dry_friction()
 
     def _follow(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         """Plans from state x at the episode's time t, and starts on the plan. It takes longer than a control step.
@@ -165,8 +169,9 @@ class NmpcController:
             self._advance(elapsed)
             u = limit * self._qp.a[0] if self._solve(x) else self._fall_back(x)
         u = np.clip(u, -limit, limit)
-        self._before = x, u
-        return u
+        forces = self._robot.overcoming(x, u, self._task.control_dt)
+        self._before = x, u + np.clip(forces, -limit, limit) - forces
+        return forces
 
     def _reserve_of_grip(self) -> float:
         """The reserve of grip that the horizon keeps: the back-off, or what the plan keeps if that is less."""
