@@ -20,7 +20,8 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from ballbot_gym import MujocoModel, files, named_robot, register_robot, urdf_te
 from ballbot_gym.env import make_task
 from ballbot_gym.robot import Sensors, read_urdf, tilt
 from ballbot_gym.rollout import Controller, PlanError
+from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
 
@@ -56,6 +58,7 @@ _LOST = 0.4  # rad of lean, at which the robot is lifted while it records
 _SPEED, _PLACE = 0.5, 0.5  # m/s and m, of the starts along each axis
 _SECONDS, _FALLEN, _NEAR = 8.0, 1.0, 0.1  # s; rad of tilt; m
 _SMALL, _AHEAD = np.radians(2), 0.3  # rad; s
+_RECOVERED = 0.9  # of the torque of the motors, which starts need in training
 _GROWS = 1.001  # in a control step: what grows faster is unstable
 
 
@@ -72,6 +75,16 @@ class FullTorque(LqrController):
         return robot.force_limit * np.sign(robot.turning_ball(x, 1e6 * falling))  # pyright: ignore
 
 
+class _Recoverable(Stabilize):
+    """Its starts need at most a share of the robot's torque. The hardest of all are those that nothing can save."""
+
+    def sample(self, rng: np.random.Generator, params: Any) -> tuple[np.ndarray, np.ndarray]:
+        x, c = super().sample(rng, params)
+        while least_torque(self, params, x) > _RECOVERED * params.force_limit * params.wheels.radius:
+            x, c = super().sample(rng, params)
+        return x, c
+
+
 class TrainedPolicy:
     """A policy for a robot, which is trained if its file does not exist. It overcomes dry friction as LQR does."""
 
@@ -85,9 +98,11 @@ class TrainedPolicy:
         if not file.exists():
             given = {"iterations": 24, "gathering_iterations": 4, "episodes_per_iteration": 32, "symmetry": "none"}
             settings = replace(LEARNERS["dagger"].settings("stabilize"), **given)
-            learner = LEARNERS["dagger"].make(task, smooth, settings, 0)
+            starts = _Recoverable(**{field.name: getattr(task, field.name) for field in fields(task)})
+            learner = LEARNERS["dagger"].make(starts, smooth, settings, 0)
             while learner.iteration < learner.iterations:
                 learner.iterate()
+            learner.network.spec = replace(learner.network.spec, task=task.problem())
             learner.network.save(file, {"training": {"learner": "dagger", "settings": asdict(settings)}})
         self._policy = PolicyController(task, smooth, PolicyNetwork.load(file, task, name))
 
@@ -227,9 +242,7 @@ def recorded(model: MujocoModel, lean: float, heading: float, seconds: float = 6
 def driven(model: MujocoModel, found: Identified, key: dict[str, str]) -> dict[str, Any]:
     """Whether the robot falls in an episode, how far from the origin it ends, and how wrong the estimate of its lean is."""
     rng, lean = np.random.default_rng(int(key["seed"])), np.radians(float(key["lean"]))
-    full = model.robot.force_limit
     robot = replace(found.robot, force_limit=found.robot.force_limit * float(key["torque"]) / torque_of(model))
-    share = full / found.robot.force_limit  # of the model's force in the identified one
     task = replace(
         make_task("stabilize", "omni"), start_position=_PLACE, start_speed=_SPEED, start_lean=lean, start_lean_rate=1e-3
     )
@@ -252,7 +265,7 @@ def driven(model: MujocoModel, found: Identified, key: dict[str, str]) -> dict[s
         u = controller.act(step * dt, seen).clip(-robot.force_limit, robot.force_limit)
         if isinstance(controller, FilteredController):
             wrong.append(controller.filter.x[2:4] - x[2:4])
-        x = model.step(share * u)
+        x = model.step(u)
         seen = sensors.observed() if senses else x
         if tilt(x) > _FALLEN:
             break
@@ -271,17 +284,22 @@ def least_torque(task: Any, robot: Any, x: np.ndarray) -> float:
 
     This model has no dry friction.
     """
-    free, rest = robot.without_dry_friction(), robot.rest()
-    ((a,), (b,)) = LinearQuadratic(task, free, rest[None], np.zeros((1, 3)), np.zeros(0)).dynamics
-    grows, own, count = schur(a.T, sort=lambda real, imaginary: np.hypot(real, imaginary) > _GROWS)
-    unstable = own[:, :count].T
-    # forces that hold it: unstable @ (a (x - rest) + b u) = unstable @ (x - rest)
-    part = unstable @ (x - rest)
-    held = np.hstack([unstable @ b, np.zeros((count, 1))])
+    of_state, of_forces = _growth(task, robot)
+    held = np.hstack([of_forces, np.zeros((len(of_forces), 1))])
     within = np.block([[np.eye(3), -np.ones((3, 1))], [-np.eye(3), -np.ones((3, 1))]])
-    wanted = part - grows[:count, :count].T @ part
+    wanted = -of_state @ (x - robot.rest())
     found = linprog([0, 0, 0, 1], within, np.zeros(6), held, wanted, bounds=(None, None))
     return float(found.x[3] * robot.wheels.radius)
+
+
+@lru_cache
+def _growth(task: Any, robot: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Two matrices: by how much the unstable part grows in a control step for a state, from rest, and for the forces."""
+    free, rest = robot.without_dry_friction(), robot.rest()
+    ((a,), (b,)) = LinearQuadratic(task, free, rest[None], np.zeros((1, 3)), np.zeros(0)).dynamics
+    _, own, count = schur(a.T, sort=lambda real, imaginary: np.hypot(real, imaginary) > _GROWS)
+    unstable = own[:, :count].T
+    return unstable @ (a - np.eye(len(a))), unstable @ b
 
 
 def torque_of(model: MujocoModel) -> float:
