@@ -19,17 +19,19 @@ FEW: dict[str, Any] = {"searches": 5, "rounds": 3}
 
 @pytest.fixture(scope="module")
 def fresh():
-    return evaluate_fresh("apg", "stabilize", 20, seed=3)
+    return evaluate_fresh("apg", "stabilize", 10, seed=3)
 
 
 @pytest.fixture(scope="module")
 def found(fresh):
-    return hard_starts("apg", fresh, **FEW)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adversarial, "_CLIMBS", 3)
+        return hard_starts("apg", fresh, **FEW)
 
 
 def test_searches_begin_at_the_hardest_episodes_and_end_at_harder_ones(fresh, found):
     began, ended = found
-    hardest = np.sort(fresh.with_optima(20, 1).regrets)[::-1][:5]
+    hardest = np.sort(fresh.with_optima(10, 1).regrets)[::-1][:5]
     assert ended.success.all()
     # many optima at once are found less exactly
     np.testing.assert_allclose(np.sort(began.regrets)[::-1], hardest, atol=0.005)
