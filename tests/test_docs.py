@@ -54,9 +54,18 @@ def test_python_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     learn = PPO.learn
     monkeypatch.setattr("ballbot_train.evaluation.evaluate.checked_episodes", lambda episodes: min(episodes, 3))
-    monkeypatch.setattr(PPO, "learn", lambda self, steps, *more: learn(self, 1, *more))  # one rollout
+
+    def learn_little(self, steps, *more):
+        self.n_epochs = 1
+        return learn(self, 1, *more)  # one rollout
+
+    monkeypatch.setattr(PPO, "learn", learn_little)
     namespace = {"__name__": "example"}
     with classic_systems() if page.name == "classic.md" else nullcontext():
+        if page.name == "classic.md":
+            from ballbot_classic import pendulum_cases
+
+            monkeypatch.setattr(pendulum_cases, "_SOLVED", 4)  # test_classic.py tests whole searches
         for block in blocks(page, "python"):
             exec(compile(block, str(page), "exec", dont_inherit=True), namespace)
 
@@ -82,6 +91,7 @@ def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(dagger, "_SECONDS", 0.5)
     for command in ("benchmark", "evaluate", "robustness"):
         monkeypatch.setattr(f"ballbot_train.commands.{command}.checked_episodes", lambda episodes: 2)
+    monkeypatch.setattr("ballbot_train.evaluation.evaluate.checked_episodes", lambda episodes: min(episodes, 2))
     monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
     monkeypatch.setattr(fresh, "evaluate_fresh", lambda policy, task, count, *more: real(policy, task, 4, *more))
     optima = fresh.FreshResult.with_optima
