@@ -125,14 +125,13 @@ def test_a_batch_computes_in_its_own_precision_whatever_torchs_default_is(name, 
 
 @pytest.mark.parametrize(("name", "robot", "learner"), SHIPPED)
 def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robot, learner):
-    """In the first certified episodes they succeed, at a regret of the order that they claim."""
+    """In the first certified episode they succeed, at a regret of the order that they claim."""
     described = PolicyFile(shipped_policies(make_task(name, robot), robot)[learner]).read()
     assert described["training"]["command"].startswith("ballbot ")
     measured = described["measured"]
     assert measured["physics"] == default_physics()
     assert measured["episodes"] == 200
-    episodes = 1 if named_robot(robot).LONG_EQUATIONS else 2  # with wheels an episode takes a second
-    row = evaluate(learner, name, episodes, robot=robot)
+    row = evaluate(learner, name, 1, robot=robot)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_mean < 3 * max(measured["regret_mean"], 0.01)
 
