@@ -121,7 +121,7 @@ class FromSensors:
 
 @pytest.mark.parametrize(
     ("name", "robot", "episodes"),
-    [("apg-ekf", "omni_strong", 2), pytest.param("lqr-ekf", "omni", 20, marks=pytest.mark.slow)],
+    [("apg-ekf", "omni_strong", 1), pytest.param("lqr-ekf", "omni", 20, marks=pytest.mark.slow)],
 )
 def test_a_compiled_filter_drives_certified_episodes_from_sensors_to_the_same_ends(name, robot, episodes, tmp_path):
     export(name, task="stabilize", format="c", out=tmp_path / "filtered.c", robot=robot)

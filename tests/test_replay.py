@@ -8,6 +8,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from ballbot_baselines.feedback import trajopt
 from ballbot_gym import certified
 from ballbot_gym.engines import default_physics
 from ballbot_gym.env import make_task
@@ -42,10 +43,18 @@ def two_takes():
     return Replay("a title", takes, (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)),))
 
 
-def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects(interpreted):
+def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects(interpreted, monkeypatch):
     pytest.importorskip("pybullet")
+    found, search = [], trajopt.plan_to_track
+
+    def once(*problem, **options):  # the plan is the same for both floors
+        found.append(found[0] if found else search(*problem, **options))
+        return found[0]
+
+    monkeypatch.setattr(trajopt, "plan_to_track", once)
     shown = certified_replay("stabilize", ["trajopt"], 1, physics="bullet", robot="rolling", frictions=[0.8, 0.6])
     expected, smoother = shown.takes
+    assert len(found) == 2
     assert (expected.label, smoother.label) == ("friction 0.8", "friction 0.6")
     assert expected.slip.max() < LEAST_SLIP < smoother.slip.max()
     assert "slips for" in smoother.note

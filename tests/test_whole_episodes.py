@@ -51,7 +51,8 @@ def test_costs_are_those_of_the_policy_s_episodes(monkeypatch):
     start = PolicyNetwork.load(shipped_policies(make_task("turn"))["ppo"], make_task("turn"))
     learner = made("turn", start=start, num_envs=16, episode_seconds=4.6)
     state = learner._batch.state
-    costs, reached = learner._episodes()
+    with torch.no_grad():
+        costs, reached = learner._episodes()
     assert reached.all()
     batch = learner._batch
     batch.state, total, running = state, torch.zeros(16), torch.ones(16, dtype=torch.bool)
@@ -61,11 +62,11 @@ def test_costs_are_those_of_the_policy_s_episodes(monkeypatch):
             result = batch.step(learner._trained(batch.observe(batch.state)))
         total += torch.where(running, result.cost, 0.0)
         running &= ~(result.terminated | result.truncated)
-    np.testing.assert_allclose(costs.detach(), total, rtol=1e-4)
+    np.testing.assert_allclose(costs, total, rtol=1e-4)
 
 
 def test_an_episode_that_fails_has_a_price_and_finite_gradients():
-    learner = made("stabilize", episode_seconds=2.0)
+    learner = made("stabilize", episode_seconds=1.5)
     with torch.no_grad():
         learner._trained.linear.weight.mul_(-1)  # away from the equilibrium
     costs, ended_well = learner._episodes()
