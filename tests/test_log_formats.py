@@ -249,7 +249,7 @@ theta = { topic = "/odom", field = "pose.pose.orientation", quantity = "lean_y",
 
 @pytest.fixture(scope="module")
 def recorded() -> Recorded:
-    return record(ROLLING, 20.0, randomization=DRAWN, physics="rk4", seed=0)
+    return record(ROLLING, 12.0, randomization=DRAWN, physics="rk4", seed=0)
 
 
 def test_a_robot_is_identified_from_a_bag(recorded: Recorded, tmp_path: Path) -> None:
