@@ -57,9 +57,7 @@ def test_apg_goes_on_from_its_state_as_if_never_stopped(name):
 def test_apg_starts_at_lqr_and_lowers_the_cost():
     """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
     task, params = TASKS["stabilize"](), default_params()
-    config = replace(
-        LEARNERS["apg"].settings("stabilize"), iterations=4, num_envs=8, episode_seconds=0.8, hidden=(32,)
-    )
+    config = replace(LEARNERS["apg"].settings("stabilize"), iterations=4, num_envs=8, episode_seconds=0.8, hidden=(32,))
     learner = apg.make(task, params, config)
     before = training.score_and_validate(learner.network, task, episodes=1)
     assert before["certified/success"] > 0.5  # LQR within the limits of tanh
