@@ -224,7 +224,7 @@ def test_forces_that_a_log_took_for_drifts_do_not_hide_the_lean():
 
 def test_logs_of_robots_with_dry_friction_have_unknown_forces_of_wheels():
     robot = replace(SAME, axle_friction=0.2)
-    log = record(robot, 5.0, randomization=None, physics="rk4").readings
+    log = record(robot, 6.0, randomization=None, physics="rk4").readings
     problem = Problem(robot, log.names)
     names = [each.name for each in problem.parameters]
     assert "force drift" not in [each.name for each in Problem(SAME, log.names).parameters]
