@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from ballbot_gym.vector.batch import BallbotBatch
 
 _ENGINES = ("auto", "native", "torch", "numpy")
+_DTYPES = ("float32", "float64")
 
 _log = logging.getLogger(__name__)
 
@@ -102,7 +104,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 nothing else, supports what "native" supports, and is the slowest. "auto" uses "native" on a CPU if it
                 supports the arguments and compile is neither True nor False. Otherwise it uses "torch", or "numpy" if
                 torch is not installed. All engines run the same episodes, to rounding. The attribute `batch` is a
-                `BallbotNative`, a `BallbotBatch` or a `BallbotArrays`.
+                `BallbotNative`, a `BallbotBatch` or a `BallbotArrays`. "native" divides large batches among as many threads
+                as torch has, if that is imported, or else $OMP_NUM_THREADS, or one for each core.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -121,9 +124,9 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics=...), or "async"'
             )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        build: Any = _in_torch if find_spec("torch") is not None else _without_torch
-        given = {"randomization": randomization, "history": history, "observation": observation}
-        batch = build(engine, task, num_envs, device, dtype, compile, params, **given)
+        arguments: Any = engine, task, num_envs, device, dtype, compile, params
+        given: Any = {"randomization": randomization, "history": history, "observation": observation}
+        batch = _without_torch(*arguments, **given) or _in_torch(*arguments, **given)
         self.batch: BallbotBatch | BallbotArrays = batch
         self._arrays: BallbotArrays | None = batch if isinstance(batch, BallbotArrays) else None
         self._dtype = self._arrays.dtype if self._arrays else np.dtype(str(batch.dtype).rpartition(".")[2]).type
@@ -292,6 +295,52 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         return state._replace(x=self._to_batch(x))
 
 
+def _without_torch(
+    engine: str,
+    task: Task,
+    num_envs: int,
+    device: str | torch.device,
+    dtype: torch.dtype | str,
+    compile: bool | str,
+    params: Robot,
+    randomization: Randomization | str | None,
+    history: int,
+    observation: str,
+) -> BallbotArrays | None:
+    """The envs in machine code or in NumPy, without an import of torch, which takes a second. None if torch is installed
+    and the arguments ask for it, or there is no machine code. The arguments are those of `BallbotVectorEnv`.
+
+    Raises:
+        ModuleNotFoundError: torch is missing, and an argument asks for what torch alone computes.
+        ValueError: as `BallbotVectorEnv`.
+    """
+    varied, installed = Randomization.checked(randomization, params), find_spec("torch") is not None
+    plain = (
+        varied == Randomization()
+        and not check_history(history)
+        and check_observation(observation, params, varied) == "state"
+    )
+    on_cpu, precision = str(device).partition(":")[0] == "cpu", str(dtype).removeprefix("torch.")
+    light = engine in ("native", "numpy") or (engine == "auto" and compile == "auto")
+    if not (plain and on_cpu and light and precision in _DTYPES):
+        if installed:
+            return None
+        if plain and on_cpu and light:
+            raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
+        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
+    real = np.float32 if precision == "float32" else np.float64
+    if engine != "numpy":
+        try:
+            return BallbotNative(task, num_envs, real, params, _threads())
+        except (ImportError, NoMachineCodeError) as error:
+            if engine == "native":
+                raise
+            _log.warning("no machine code, so the envs are slower: %s", error)
+            if installed:
+                return None
+    return BallbotArrays(task, num_envs, real, params)
+
+
 def _in_torch(
     engine: str,
     task: Task,
@@ -301,90 +350,31 @@ def _in_torch(
     compile: bool | str,
     params: Robot,
     **settings: Any,
-) -> BallbotBatch | BallbotArrays:
-    """The batch of envs if torch is installed. The arguments are those of `BallbotVectorEnv`."""
+) -> BallbotBatch:
+    """The envs in torch. The arguments are those of `BallbotVectorEnv`.
+
+    Raises:
+        ValueError: as `BallbotVectorEnv`, or another engine does not support the arguments.
+    """
     import torch
 
     from ballbot_gym.vector.batch import BallbotBatch
 
-    cpu = torch.device(device).type == "cpu"
-    if engine in ("native", "numpy") and not cpu:
+    light = engine in ("native", "numpy")
+    if light and torch.device(device).type != "cpu":
         raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
-    wanted = engine in ("native", "numpy") or (engine == "auto" and cpu and compile == "auto")
-    # the batch is made in any case, because it checks the arguments; it allocates nothing
-    batch = BallbotBatch(task, num_envs, device, dtype, False if wanted else compile, params, **settings)
-    if wanted:
-        real = np.float32 if batch.dtype == torch.float32 else np.float64
-        plain = batch.randomization == Randomization() and not batch.history and batch.observation == "state"
-        if found := _without_gradients(
-            engine, batch.task, num_envs, real, batch.params, plain, torch.get_num_threads()
-        ):
-            return found
-    return BallbotBatch(task, num_envs, device, dtype, compile, params, **settings)
+    batch = BallbotBatch(task, num_envs, device, dtype, False if light else compile, params, **settings)
+    if light:
+        raise ValueError(f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"')
+    return batch
 
 
-def _without_torch(
-    engine: str,
-    task: Task,
-    num_envs: int,
-    device: str,
-    dtype: str,
-    compile: bool | str,
-    params: Robot,
-    randomization: Randomization | str | None,
-    history: int,
-    observation: str,
-) -> BallbotArrays:
-    """The batch of envs if torch is missing. The arguments are those of `BallbotVectorEnv`.
-
-    Raises:
-        ModuleNotFoundError: an argument asks for what torch alone computes.
-        ValueError: as `BallbotVectorEnv`.
-    """
-    varied = Randomization.checked(randomization, params)
-    plain = (
-        varied == Randomization()
-        and not check_history(history)
-        and check_observation(observation, params, varied) == "state"
-    )
-    if engine == "torch" or device != "cpu" or compile != "auto" or (engine == "auto" and not plain):
-        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
-    if dtype not in ("float32", "float64"):
-        raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
-    real = np.float32 if dtype == "float32" else np.float64
-    found = _without_gradients(engine, task, num_envs, real, params, plain, os.cpu_count() or 1)
-    return found or BallbotArrays(task, num_envs, real, params)
-
-
-def _without_gradients(
-    engine: str,
-    task: Task,
-    num_envs: int,
-    dtype: type[np.floating],
-    params: Robot,
-    plain: bool,
-    threads: int,
-) -> BallbotArrays | None:
-    """The envs in machine code or in NumPy. Where that is not possible: None, or an error if the engine must be that.
-
-    Args:
-        plain: whether nothing varies and no sensors or past observations are shown.
-    """
-    if not plain:
-        if engine != "auto":
-            raise ValueError(
-                f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"'
-            )
-        return None
-    if engine == "numpy":
-        return BallbotArrays(task, num_envs, dtype, params)
-    try:
-        return BallbotNative(task, num_envs, dtype, params, threads)
-    except (ImportError, NoMachineCodeError) as error:
-        if engine == "native":
-            raise
-        _log.warning("no machine code, so the envs are slower: %s", error)
-        return None
+def _threads() -> int:
+    """How many threads torch has, or would have."""
+    if torch := sys.modules.get("torch"):
+        return torch.get_num_threads()
+    wanted = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(wanted) if wanted.isdigit() and int(wanted) else os.cpu_count() or 1
 
 
 def _most_steps(max_episode_steps: int | None, task: Task) -> int:
