@@ -257,7 +257,7 @@ def test_code_of_this_package_is_printed_once_on_a_machine_and_that_of_users_by_
 
 
 def test_copies_of_this_package_share_its_printed_code_until_a_file_changes(monkeypatch, tmp_path):
-    digest = libraries._digest_of_package.__wrapped__
+    digest = libraries._digests_of_package.__wrapped__
     own = digest()
     copy = shutil.copytree(libraries._PACKAGE, tmp_path / "ballbot_gym", copy_function=shutil.copyfile)
     monkeypatch.setattr(libraries, "_PACKAGE", copy)

@@ -153,7 +153,7 @@ def printed(name: str, problem: tuple[Any, ...], kinds: tuple[type, ...], source
     if not all(kind.__module__.startswith(f"{_PACKAGE.name}.") for kind in kinds):
         return source()
     content = [_fields(part) if dataclasses.is_dataclass(part) else repr(part) for part in problem]
-    key = hashlib.sha256("\0".join([_digest_of_package(), *content]).encode()).hexdigest()[:_DIGITS]
+    key = hashlib.sha256("\0".join([_digests_of_package(), *content]).encode()).hexdigest()[:_DIGITS]
     try:
         path = cache_folder() / f"{name}-{key}.c"
         if path.is_file():
@@ -175,14 +175,10 @@ def _fields(part: Any) -> str:
 
 
 @cache
-def _digest_of_package() -> str:
-    """A digest of the files of this package, so that every copy of it prints the same code once."""
+def _digests_of_package() -> str:
+    """The files of this package and their digests, so that every copy of it prints the same code once."""
     found = sorted(path for path in _PACKAGE.rglob("*") if path.suffix in (".py", ".c", ".h"))
-    digest = hashlib.sha256()
-    for path in found:
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(_PACKAGE).as_posix()} {len(content)}\0".encode() + content)
-    return digest.hexdigest()
+    return "\0".join(f"{path.relative_to(_PACKAGE).as_posix()} {_digest(path)}" for path in found)
 
 
 def cache_folder() -> Path:
