@@ -170,6 +170,7 @@ class NmpcController:
             u = limit * self._qp.a[0] if self._solve(x) else self._fall_back(x)
         u = np.clip(u, -limit, limit)
         forces = self._robot.overcoming(x, u, self._task.control_dt)
+        # what is left of u for the model without friction, where the limit cuts the forces
         self._before = x, u + np.clip(forces, -limit, limit) - forces
         return forces
 
