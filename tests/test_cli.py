@@ -226,6 +226,8 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
         (("--physics", "pybullet"), ["--physics", "bullet"]),
         (("--out", "BallbotTurn-v0"), ["--out", "BallbotTurn-v0"]),
         (("--out=pybullet", "BallbotNone-v0"), ["--out=pybullet", "BallbotNone-v0"]),
+        (("--out", "no_module:baseline"), ["--out", "no_module:baseline"]),
+        (("runs/a", "--name", "no_module:turn"), ["runs/a", "--name", "no_module:turn"]),
     ],
 )
 def test_ids_and_names_of_libraries_are_understood(typed_as, means):

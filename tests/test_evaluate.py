@@ -18,7 +18,7 @@ from rich.console import Console
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import make_task
-from ballbot_gym.robot import named_robot
+from ballbot_gym.robot import ROBOTS, Registered, default_params, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import controllers, evaluate, runner
 from ballbot_train.evaluation.comparison import compare
@@ -217,6 +217,18 @@ def test_a_worker_needs_no_file_of_a_policy(tmp_path, monkeypatch):
     groups = [runner.Group("turn", name, "rk4") for name in (str(folder / "mine.json"), "dagger")]
     own, shipped = runner.MeasuredRun(tmp_path).measure(groups, 1)
     assert own.cost == shipped.cost
+
+
+def test_fresh_episodes_are_of_the_robot_that_is_given(monkeypatch):
+    heavy = replace(default_params(), body_mass=30.0)
+
+    def costs(robot):
+        return evaluate.evaluate(lambda seen: 0 * seen[:, :2], "stabilize", robot=robot, fresh=5).costs
+
+    with pytest.raises(ValueError, match=r"this robot has no name.*register_robot"):
+        costs(heavy)
+    monkeypatch.setitem(ROBOTS, "heavy", Registered(heavy, {}))
+    assert (costs(heavy) != costs(default_params())).all()
 
 
 def test_whatever_is_evaluated_can_be_compared(tmp_path):

@@ -21,6 +21,7 @@ from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import SubmissionError, verify
 from ballbot_train.learning import dagger
 from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.rsl import RslVecEnv
 from ballbot_train.policy.files import PolicySpec
 from ballbot_train.policy.network import PolicyController, PolicyNetwork
 
@@ -285,6 +286,11 @@ def test_learners_command_three_motors(robot, learner, settings, monkeypatch):
     assert any((part != before[name]).any() for name, part in made.network.state_dict().items())
     with pytest.raises(ValueError, match="cannot start"):
         algorithm.make(task, robot, settings, 0, start=PolicyNetwork(PolicySpec.of(task, hidden=(8,))))
+
+
+def test_rsl_rl_commands_three_motors(robot):
+    env = RslVecEnv(BallbotBatch("stabilize", 2, robot="omni"))
+    assert env.num_actions == robot.action_size == 3
 
 
 def test_a_free_heading_costs_nothing(robot):

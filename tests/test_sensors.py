@@ -12,6 +12,8 @@ from ballbot_gym.robot import TRACKS, Sensors, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_train.evaluation.controllers import ControllerName, controllers_of
 from ballbot_train.evaluation.evaluate import evaluate
+from ballbot_train.report.replay import certified_replay
+from ballbot_train.report.simulation import Playground
 
 DT = 0.02
 
@@ -141,6 +143,30 @@ def test_evaluation_shows_sensors_to_a_filtered_controller():
     assert [row.success for row in rows] == [1, 1]
     assert 0 < rows[1].regret_mean - rows[0].regret_mean < 0.1
     assert controllers_of(["stabilize"], ["lqr-ekf"], ["omni"]) == {"omni": {"stabilize": ["lqr-ekf"]}}
+
+
+def test_replays_and_the_playground_show_sensors_to_a_filtered_controller():
+    first, again = (certified_replay("stabilize", ["lqr-ekf"], 0, "rk4", robot="omni").takes[0] for _ in range(2))
+    playground = Playground("stabilize", "lqr-ekf", physics="rk4", robot="omni")
+    for _ in range(100):
+        playground.step()
+    playground.close()
+    assert not first.failed
+    np.testing.assert_array_equal(first.trajectory.x, again.trajectory.x)
+    assert (playground.main.violated, playground.notice) == ("", "")
+
+
+def test_the_playground_changes_to_a_controller_that_takes_sensors_and_back():
+    playground = Playground("stabilize", "lqr", physics="rk4", robot="omni")
+    for name in ("lqr-ekf", "lqr", "lqr-ekf"):
+        for _ in range(25):
+            playground.step()
+        playground.set_controller(name)
+    playground.set_plant("mass", playground.plant["mass"])
+    for _ in range(50):
+        playground.step()
+    assert (playground.main.violated, playground.notice) == ("", "")
+    playground.close()
 
 
 def test_the_wrapper_shows_a_policy_the_state():

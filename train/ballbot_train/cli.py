@@ -35,8 +35,8 @@ from ballbot_train.commands import COMMANDS, GROUPS, MOVED, RESUMABLE
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
 _NO_READER = 141  # the exit status of a process that the signal SIGPIPE ended
-_ID = re.compile(r"([\w-]+/)?\w+-v\d+")  # of an environment
-_HYPHENS = re.compile("[a-z0-9]+(-[a-z0-9]+)+")
+_NAMING = ("", "--task", "--tasks", "--robot", "--made-for", "--physics")
+"""Flags that are followed by names; "" stands for the place before the first flag."""
 _MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[a-z][a-z0-9_]*")
 
 
@@ -159,34 +159,35 @@ def _announce_compilation() -> None:
 
 
 def _registered(options: list[str]) -> list[str]:
-    """The options with the names of tasks, robots and physics that they bring: of MODULE:NAME the module is imported, from
-    this folder too, a path after --robot is registered under its file's name, and other names become ours: the id of a task
-    or of its counterpart, a task with hyphens, and "pybullet".
+    """The options with the names of tasks, robots and physics that they bring."""
+    named, flag = [], ""
+    for option in options:
+        given, equals, word = option.partition("=") if option.startswith("--") else ("", "", option)
+        flag = given or flag
+        named.append(f"{given}{equals}{_registered_word(flag, word) if word and flag in _NAMING else word}")
+    return named
+
+
+def _registered_word(flag: str, word: str) -> str:
+    """The name that a word after a flag means: of MODULE:NAME the module is imported, from this folder too, a path after
+    --robot is registered under its file's name, and other names become ours: the id of a task or of its counterpart, a task
+    with hyphens, and "pybullet".
     """
     from ballbot_gym.engines import PHYSICS_ALIASES
     from ballbot_gym.robot import short_name
+    from ballbot_gym.tasks import TASKS
 
-    named = []
-    for option in options:
-        flag, equals, word = option.partition("=") if option.startswith("--") else ("", "", option)
-        if _MODULE_AND_NAME.fullmatch(word):
-            if os.getcwd() not in sys.path:
-                sys.path.append(os.getcwd())  # last, so that no file here takes the place of a library
-            word = short_name(word)
-        elif word.endswith((".urdf", ".xml", ".mjcf")) and "--robot" in (flag, *named[-1:]):
-            word = _registered_file(Path(word))
-        elif _ID.fullmatch(word) and "--out" not in (flag, *named[-1:]):
-            from ballbot_gym.tasks import TASKS
-
-            word = next((name for name, kind in TASKS.items() if word in (kind.id, kind.counterpart)), word)
-        elif not flag and _HYPHENS.fullmatch(word) and named and named[-1] != "--out":
-            from ballbot_gym.tasks import TASKS
-
-            word = word.replace("-", "_") if word.replace("-", "_") in TASKS else word
-        elif word in PHYSICS_ALIASES and "--out" not in (flag, *named[-1:]):
-            word = PHYSICS_ALIASES[word]
-        named.append(f"{flag}{equals}{word}")
-    return named
+    if _MODULE_AND_NAME.fullmatch(word):
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())  # last, so that no file here takes the place of a library
+        return short_name(word)
+    if flag == "--robot" and word.endswith((".urdf", ".xml", ".mjcf")):
+        return _registered_file(Path(word))
+    if flag == "--physics":
+        return PHYSICS_ALIASES.get(word, word)
+    tasks = {alias: name for name, kind in TASKS.items() for alias in (kind.id, kind.counterpart)}
+    underscored = word.replace("-", "_")
+    return tasks.get(word, underscored if underscored in TASKS else word)
 
 
 def _registered_file(path: Path) -> str:

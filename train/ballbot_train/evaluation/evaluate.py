@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, overload
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.registry import name_of
-from ballbot_gym.robot import PAPER, Randomization, Robot, robot_name
+from ballbot_gym.robot import PAPER, Randomization, Robot, registered_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_parts
 from ballbot_train.evaluation import counterparts, optima
 from ballbot_train.evaluation.controllers import ControllerName, as_controller
 from ballbot_train.evaluation.recordings import Recording
 from ballbot_train.evaluation.results import Result, Row, leaderboard, read_results, write_results
-from ballbot_train.evaluation.runner import checked_episodes, run_episodes
+from ballbot_train.evaluation.runner import _showing, checked_episodes, run_episodes
 from ballbot_train.work.console import progress_bars
 from ballbot_train.work.executors import Workers
 from ballbot_train.work.provenance import provenance
@@ -86,7 +86,7 @@ def evaluate(
         name: name of the row; default, the policy's own.
         randomization: parameters hidden from the policy, or a name in `TRACKS`; default, none. Regret is measured against
             the optimum of each episode's own robot and delay, although the policy does not get them.
-        robot: a name in `ROBOTS`, or any Robot.
+        robot: a name in `ROBOTS`, or any Robot; on fresh episodes it must be registered.
         workers: number of processes that compute optima; default, this process only. Other processes import the main script,
             as in `multiprocessing`, so the script must do its work under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
@@ -111,11 +111,7 @@ def evaluate(
         indices = range(checked_episodes(episodes))
         policy = counterparts.translated(policy, task, env.task, env.params)
         controller = as_controller(policy, env.task, env.params, filter)
-        if getattr(controller, "senses", False):
-            env.close()
-            env = BallbotEnv(
-                env.task, env.physics, params=env.params, randomization=env.randomization, observation="sensors"
-            )
+        env = _showing(env, controller)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         written = ControllerName(str(policy)) if isinstance(policy, str | Path) else None
         file = str(Path(policy).absolute()) if written is not None and written.is_file else ""
@@ -148,7 +144,7 @@ def _on_fresh(
     if filter and not isinstance(policy, str | Path):
         raise ValueError("on fresh episodes a filter needs a policy by name or file; give one, or leave out filter")
     policy = ControllerName(str(policy)).behind(filter).text if filter else policy
-    robot = robot if isinstance(robot, str) else robot_name(robot)
+    robot = robot if isinstance(robot, str) else registered_name(robot)
     return evaluate_fresh(policy, task, count, name=name, robot=robot, randomization=randomization)
 
 

@@ -255,16 +255,29 @@ def _episode_entries(
 ) -> Iterator[jobs.Entry]:
     robot, varied = floor(group.robot, group.friction), group.randomization
     made = as_controller(sent, *group.believed)
-    world: dict[str, Any] = {"randomization": varied, "robot": robot, **group.fields}
-    if getattr(made, "senses", False):
-        world["observation"] = "sensors"
-    env = BallbotEnv(group.task, physics=group.physics, **world)
+    env = _showing(BallbotEnv(group.task, group.physics, randomization=varied, robot=robot, **group.fields), made)
     motions: list[Recording] | None = [] if record else None
     results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)
     env.close()
     for i, result in enumerate(results):
         moved = {} if motions is None else {"motion": base64.b64encode(motions[i].to_bytes()).decode()}
         yield asdict(result) | moved
+
+
+def _senses(controller: Controller) -> bool:
+    """Whether a controller takes the readings of sensors, and not states."""
+    return getattr(controller, "senses", False)
+
+
+def _showing(env: BallbotEnv, controller: Controller) -> BallbotEnv:
+    """The env, if it shows what the controller takes. If that is the readings of sensors, and the env shows states, it is
+    closed, and another like it that shows the sensors is returned.
+    """
+    if env.observation == "sensors" or not _senses(controller):
+        return env
+    env.close()
+    world: Any = {"params": env.params, "randomization": env.randomization}
+    return BallbotEnv(env.task, env.physics, observation="sensors", **world)
 
 
 def checked_episodes(episodes: int) -> int:

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 class RslVecEnv:
     """A `BallbotBatch` with the interface of rsl-rl's `VecEnv`. Observations are the group "policy"."""
 
-    num_actions = 2
-
     def __init__(self, batch: BallbotBatch, seed: int = 0):
         """Starts an episode in every env.
 
@@ -24,7 +22,7 @@ class RslVecEnv:
             seed: seed of the run; runs with different seeds have no episodes in common.
         """
         self.batch, self.num_envs, self.device = batch, batch.num_envs, batch.device
-        self.max_episode_length = batch.task.steps
+        self.max_episode_length, self.num_actions = batch.task.steps, batch.params.action_size
         self.cfg: dict[str, Any] = {"task": batch.task.id, "num_envs": batch.num_envs}
         batch.reset(spawned(seed))
 

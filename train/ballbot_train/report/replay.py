@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_gym import certified
+from ballbot_gym import certified, seeding
 from ballbot_gym.drawing import Drawing, Drawn, GroundPath
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, Robot, default_params, named_robot
@@ -18,7 +18,7 @@ from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.names import shortened
 from ballbot_train.evaluation.results import Result
-from ballbot_train.evaluation.runner import floor
+from ballbot_train.evaluation.runner import _showing, floor
 from ballbot_train.policy.files import PolicyFile, shipped_policies, shipped_ways
 from ballbot_train.report import labels
 
@@ -141,12 +141,10 @@ def certified_replay(
     named = labels.labels(controllers, task, ways)
     for name, friction in itertools.product(controllers, frictions or (None,)):
         controller, slips = ControllerName(name).make(problem, params), list[float]()
-        env = BallbotEnv(problem, physics=physics, robot=floor(robot, friction))
+        env = _showing(BallbotEnv(problem, physics=physics, robot=floor(robot, friction)), controller)
         try:
-            options = episode_set.options(episode)
-            run = rollout(
-                env, controller, options=options, watch=lambda _, env=env, slips=slips: slips.append(env.slip)
-            )
+            seed, options = seeding.of_episode(0, episode), episode_set.options(episode)
+            run = rollout(env, controller, seed, options, lambda _, env=env, slips=slips: slips.append(env.slip))
         except PlanError:
             if not skip_planless:
                 raise

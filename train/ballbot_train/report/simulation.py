@@ -21,6 +21,7 @@ from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import ControllerName
 from ballbot_train.evaluation.robustness import STRESSES
+from ballbot_train.evaluation.runner import _senses, _showing
 from ballbot_train.policy.files import BEST
 from ballbot_train.report import labels
 from ballbot_train.work.console import check_names
@@ -79,6 +80,11 @@ class Runner:
     """Largest tilt, rad."""
     violated: str = ""
     arrived: bool = False
+    seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(no,) what the environment shows."""
+
+    def __post_init__(self) -> None:
+        self.env = _showing(self.env, self.controller)
 
     @property
     def x(self) -> State:
@@ -102,7 +108,7 @@ class Runner:
 
     def begin(self, start: tuple[np.ndarray, np.ndarray], seed: int) -> None:
         """Begins an episode in a state (n,) with constants (nc,). The seed is of all that is drawn in it."""
-        self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
+        self.seen, _ = self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
         self.states, self.forces = [tuple(start[0].tolist())], []
         self.cost, self.peak, self.violated, self.arrived = 0.0, float(tilt(self.x)), "", False
 
@@ -110,10 +116,21 @@ class Runner:
         """Continues the episode in another environment."""
         before = self.env.get_state()
         self.env.close()
-        self.env = env
-        self.env.reset(seed=0)
+        self.env = _showing(env, self.controller)
+        where = None if self.stands_still else {"state": self.x, "constants": before.constants}
+        self.seen, _ = self.env.reset(seed=0, options=where)
         kept = {name: getattr(before, name) for name in ("constants", "steps_left", "rng")}
         self.env.set_state(self.env.get_state()._replace(x=self.x, memory=(), **kept))
+
+    def prepare(self, seconds: float) -> None:
+        """The controller begins at a time of the episode, s, or raises what its `reset` raises."""
+        self.controller.reset(seconds, self._shown(seconds), np.array(self.env.get_state().constants))
+
+    def _shown(self, seconds: float) -> np.ndarray:
+        """What the controller is shown at a time of the episode, s: what the sensors read, or the state."""
+        if _senses(self.controller):
+            return self.seen
+        return sensed(self.env, np.array(self.x), seconds)
 
     def command(self, seconds: float) -> np.ndarray:
         """(m,) the force, N, that the controller commands at that time of the episode, s.
@@ -121,8 +138,7 @@ class Runner:
         Raises:
             FloatingPointError: a force that is not finite.
         """
-        u = self.controller.act(seconds, sensed(self.env, np.array(self.x), seconds))
-        u = np.asarray(u, np.float64)
+        u = np.asarray(self.controller.act(seconds, self._shown(seconds)), np.float64)
         if u.shape != (self.env.params.action_size,) or not np.isfinite(u).all():
             raise FloatingPointError(f"it commands {u} N")
         return u
@@ -135,7 +151,7 @@ class Runner:
 
     def step(self, command: np.ndarray) -> None:
         """Holds a command (m,), N, for one control step."""
-        _, _, terminated, _, info = self.env.step(command / self.env.params.force_limit)
+        self.seen, _, terminated, _, info = self.env.step(command / self.env.params.force_limit)
         self.states.append(tuple(info["state"].tolist()) if np.isfinite(info["state"]).all() else self.x)
         self.forces.append(tuple(info["force"].tolist()))
         self.cost += info["cost"]
@@ -325,10 +341,17 @@ class Playground:
 
     def set_controller(self, name: str) -> None:
         """Another controller for the main robot, which continues where it is."""
-        controller = self._made(name, self.world)
-        if not self.ended:
-            controller.reset(self.seconds, np.array(self.main.x), self.start[1])
-        self.main.name, self.main.controller = name, controller
+        main, controller = self.main, self._made(name, self.world)
+        before, main.controller = main.controller, controller
+        try:
+            if _senses(controller) != _senses(before):
+                main.move_to(self._env(self.world))
+            if not self.ended:
+                main.prepare(self.seconds)
+        except Exception:
+            main.controller = before
+            raise
+        main.name = name
         if self.ended:
             self.restart()
 
@@ -400,12 +423,12 @@ class Playground:
         for runner in self.runners:
             self.announce(f"preparing {labels.label(runner.name)} …")
             try:
-                runner.controller.reset(0.0, *map(np.array, start))
+                runner.prepare(0.0)
             except Exception as error:
                 self.notice = f"{labels.label(runner.name)} cannot start here, LQR does instead: {error}"
                 runner.name = "lqr"
                 runner.controller = ControllerName("lqr").make(self.world.task, self.world.params)
-                runner.controller.reset(0.0, *map(np.array, start))
+                runner.prepare(0.0)
 
     def _env(self, world: _World) -> BallbotEnv:
         """With what the controllers do not know: the true robot, its actuator, sensors and pushes.
