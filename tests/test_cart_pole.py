@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import ballbot_gym
 from ballbot_baselines import CONTROLLERS, find_optima, find_optimum
 from ballbot_gym import TASKS, BallbotBatch, BallbotEnv, BallbotVectorEnv, rollout
-from ballbot_gym.robot import ROBOTS
+from ballbot_gym.robot import PAPER, ROBOTS
 from ballbot_train import evaluate
 from ballbot_train.cli import _run as main
 
@@ -108,7 +108,7 @@ def test_its_optimum_swings_up_and_nmpc_nearly_reaches_it(cart_pole, env):
     assert optimum.is_optimal
     assert env.task.is_goal(optimum.trajectory.x[-1], c)
     assert np.abs(optimum.trajectory.u).max() <= robot.force_limit
-    (together,) = find_optima("cart_pole", "cart_pole", x[None], c[None])
+    (together,) = find_optima("cart_pole", PAPER, x[None], c[None])
     assert together is not None
     assert together.cost == pytest.approx(optimum.cost, rel=1e-6)
     for name, least, most in (("lqr", 1.0, np.inf), ("trajopt", 0, 0.05), ("nmpc", 0, 0.01)):

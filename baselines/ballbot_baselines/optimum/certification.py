@@ -19,8 +19,8 @@ from ballbot_baselines.solvers.compiled import LANES
 from ballbot_baselines.solvers.shooting import SAME_BARRIER, Backoff, Shooting
 from ballbot_gym.certified import EvaluationSet
 from ballbot_gym.certified.cache import episode, starts
-from ballbot_gym.env import make_task
-from ballbot_gym.robot import PAPER, Randomization, Robot, checked_robot
+from ballbot_gym.env import make_task, robot_of
+from ballbot_gym.robot import PAPER, Randomization, Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -52,7 +52,7 @@ def entries(
     Raises:
         ValueError: no task or robot of that name.
     """
-    task, params, left = make_task(task, robot), checked_robot(robot), iter(indices)
+    task, params, left = make_task(task, robot), robot_of(task, robot), iter(indices)
     redrawn = None if params.grips or randomization.moves_optima else 1
     while some := list(itertools.islice(left, AT_ONCE)):
         x0, c = (np.array(part) for part in zip(*(episode(task, params, index) for index in some), strict=True))

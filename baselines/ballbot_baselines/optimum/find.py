@@ -24,8 +24,8 @@ from ballbot_baselines.solvers.riccati import tube_gains
 from ballbot_baselines.solvers.shooting import SAME_BARRIER, Backoff, Shooting
 from ballbot_gym import certified
 from ballbot_gym.checks import finite_array
-from ballbot_gym.env import make_task
-from ballbot_gym.robot import Robot, checked_robot
+from ballbot_gym.env import make_task, robot_of
+from ballbot_gym.robot import Robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.paths import sides_passed
@@ -51,7 +51,7 @@ def find_optimum(
 
     Args:
         task: the problem, or its name in `TASKS`.
-        params: the robot, or its name in `ROBOTS`.
+        params: the robot, or its name in `ROBOTS`; "paper" stands for the robot that the task names, as everywhere.
         x0: (8,) initial state, m, rad, m/s, rad/s; order in `Ballbot.STATE`; (11,) with wheels.
         c: (nc,) constants of the episode, named in the task's `constant_names`; (0,) where it has none.
         backoff: distance from the limits that the motion keeps; default, none, for the true optimum.
@@ -70,7 +70,7 @@ def find_optimum(
         PlanError: no try led to a feasible motion.
         ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
     """
-    task, params = make_task(task, params), checked_robot(params)
+    task, params = make_task(task, params), robot_of(task, params)
     x0, c = finite_array(x0, (params.state_size,), "x0"), finite_array(c, (len(task.constant_names),), "c")
     episode = Shooting(task, params, x0, c, backoff, start)
     started = time.perf_counter()
@@ -111,7 +111,7 @@ def certified_optimum(task: str | Task, params: str | Robot, x0: np.ndarray, c: 
 
     Args:
         task: the problem, or its name in `TASKS`.
-        params: the robot, or its name in `ROBOTS`.
+        params: the robot, or its name in `ROBOTS`; "paper" stands for the robot that the task names, as everywhere.
         x0: (8,) initial state.
         c: (nc,) constants of the episode.
 
@@ -119,7 +119,7 @@ def certified_optimum(task: str | Task, params: str | Robot, x0: np.ndarray, c: 
         None where no certified episode starts so, or the set does not have its motion. A set may have the motions of its
         first episodes alone.
     """
-    task, params = make_task(task, params), checked_robot(params)
+    task, params = make_task(task, params), robot_of(task, params)
     try:
         known = certified.load(task, params)
     except certified.CertificateError:
@@ -162,7 +162,7 @@ def find_optima(
 
     Args:
         task: the problem, or its name in `TASKS`.
-        params: the robot, or its name in `ROBOTS`.
+        params: the robot, or its name in `ROBOTS`; "paper" stands for the robot that the task names, as everywhere.
         x0: (B, 8) initial states; (B, 11) with wheels.
         c: (B, nc) constants; (B, 0) where the task has none.
         backoff: distance kept from limits; none for the true optimum.
@@ -176,7 +176,7 @@ def find_optima(
     Raises:
         ValueError: no task or robot of that name, or x0 or c has another shape or is not finite, or sides do not fit them.
     """
-    task, params = make_task(task, params), checked_robot(params)
+    task, params = make_task(task, params), robot_of(task, params)
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     for name, array, width in (("x0", x0, params.state_size), ("c", c, len(task.constant_names))):
         if array.ndim != 2 or array.shape != (len(x0), width):
