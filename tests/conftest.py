@@ -1,7 +1,9 @@
 """Fixtures that parametrize tests over everything registered, so that a new task arrives tested."""
 
+import contextlib
 import functools
 import gc
+import importlib
 import itertools
 import os
 import sys
@@ -9,6 +11,13 @@ import sys
 # Before torch is imported, here and in the processes that tests start: nothing in them is big enough for a second thread,
 # and on busy cores threads wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+if os.environ.get("PYTEST_XDIST_WORKER") == "gw1":
+    # The first worker imports these after torch. So where there is no bytecode yet, as after an installation, each compiles
+    # what the other then finds, and not both the same.
+    for name in ("matplotlib.pyplot", "scipy.optimize", "casadi", "tyro", "minari"):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
 
 import gymnasium
 import numpy as np

@@ -33,7 +33,7 @@ def played(env, steps=60):
 )
 def test_envs_in_numpy_do_what_machine_code_does(task, robot, mode):
     pytest.importorskip("casadi")
-    make = {"robot": robot, "autoreset_mode": mode, "duration": 0.8, "dtype": "float64"}
+    make = {"robot": robot, "autoreset_mode": mode, "duration": 0.5, "dtype": "float64"}
     told = [played(BallbotVectorEnv(21, task, engine=engine, **make)) for engine in ("numpy", "native")]
     assert any((step[2] | step[3]).any() for step in told[0])  # episodes end, and others begin
     for ours, theirs in zip(*told, strict=True):

@@ -192,8 +192,8 @@ def test_behind_its_filter_lqr_brings_a_robot_to_rest_whose_friction_and_centre_
     np.testing.assert_allclose(info["state"][:2], 0.0, atol=0.05)
 
 
-def test_nmpc_plans_without_dry_friction_and_overcomes_it():
-    task, robot = make_task("stabilize", "omni"), replace(SAME, axle_friction=0.3)
+def test_nmpc_plans_without_dry_friction_and_overcomes_it(interpreted):
+    task, robot = make_task("stabilize", "omni", duration=2.0), replace(SAME, axle_friction=0.3)
     x, forces = np.array([0.3, -0.2, 0.03, 0.02, 0.1, *[0.0] * 6]), []
     for model in (robot, robot.without_dry_friction()):
         nmpc = NmpcController(task, model)

@@ -60,7 +60,7 @@ def test_threads_change_nothing(monkeypatch):
     monkeypatch.setattr(native, "_PARALLEL_FROM", 64)
     actions, results = actions_of(2500, 30), []
     for threads in (1, 3):
-        env = BallbotVectorEnv(2500, "weave", engine="native", duration=0.4)
+        env = BallbotVectorEnv(2500, "weave", engine="native", duration=0.5)
         env.batch.threads = threads
         results.append(play(env, actions, 0))
     for a, b in zip(*results, strict=True):

@@ -72,7 +72,7 @@ def test_episodes_of_a_policy_carry_no_gradient():
 
 def test_episodes_of_a_policy_in_machine_code_are_those_in_torch(task, rng):
     """Some end at the goal or at a limit; then the robot begins again, and what it does does not count any more."""
-    task = replace(task, duration=0.6)
+    task = replace(task, duration=0.5)
     params = default_params()
     starts = [task.sample(np.random.default_rng(seed), params) for seed in range(8)]
     x, c = (np.array(part, float).reshape(8, -1) for part in zip(*starts, strict=True))

@@ -243,7 +243,9 @@ ilqr = functools.lru_cache(maxsize=8)(_Ilqr)
 @functools.cache
 def _compiled(task: Task, kind: Kind, free_time: bool, rests: bool) -> tuple[ctypes.CDLL, dict[str, int]]:
     """The functions of ilqr.c for a task and a kind of robot, and the sizes that they were made for."""
-    stage, name = _Stage(task, kind, free_time, rests), f"{task.id}-ilqr{'-free' if free_time else ''}"
+    stage = _Stage(task, kind, free_time, rests)
+    # no name of a task, so that tasks with the same code share its library
+    name = "ilqr-free" if free_time else "ilqr"
     return ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.sizes
 
 
