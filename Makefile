@@ -153,13 +153,11 @@ certify: $(VENV)/installed
 # PyBullet has no wheels for newer Pythons than 3.11. Where it is missing, uv fetches it. Python compiles what is imported, when
 # it is first imported; pip would compile everything. Python 3.11 brings a pip that takes twice the time to resolve and install,
 # and `venv` compiles that one first, so the new pip comes from the interpreter's own where that can install into other folders.
-# What builds this package is installed beside it: in an environment of its own that is done anew for each install.
-INSTALL := $(BIN)/pip install --no-compile --no-build-isolation -c constraints.txt
-TOOLS := --no-compile "pip>=25" hatchling hatch-fancy-pypi-readme editables
+INSTALL := $(BIN)/pip install --no-compile -c constraints.txt
 
 $(VENV)/python: pyproject.toml constraints.txt
 	@if command -v $(PYTHON) >/dev/null; then \
-		{ $(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(VENV) install $(TOOLS); } || \
+		{ $(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(VENV) install --no-compile "pip>=25"; } || \
 			$(PYTHON) -m venv $(VENV); \
 	elif command -v uv >/dev/null; then \
 		uv venv --allow-existing --seed --python 3.11 $(VENV); \
@@ -168,7 +166,7 @@ $(VENV)/python: pyproject.toml constraints.txt
 		echo "Install Python 3.11 or uv, or name your interpreter: make PYTHON=/path/to/python3.11"; \
 		exit 1; \
 	fi
-	$(BIN)/python -m pip install $(TOOLS)
+	$(BIN)/python -m pip install --no-compile "pip>=25"
 	touch $@
 
 # what the commands need
