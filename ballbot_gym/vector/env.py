@@ -31,9 +31,9 @@ from ballbot_gym.robot import PAPER, Randomization, Robot
 from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.arrays import BallbotArrays
-from ballbot_gym.vector.autoreset import _as_array, _filled, _info_of, _masked, step
+from ballbot_gym.vector.autoreset import _as_array, gymnasium_reset, gymnasium_step
 from ballbot_gym.vector.native import BallbotNative
-from ballbot_gym.vector.state import BatchState, _check_starts
+from ballbot_gym.vector.state import BatchState
 
 if TYPE_CHECKING:
     import torch
@@ -128,8 +128,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         given: Any = {"randomization": randomization, "history": history, "observation": observation}
         batch = _without_torch(*arguments, **given) or _in_torch(*arguments, **given)
         self.batch: BallbotBatch | BallbotArrays = batch
-        self._arrays: BallbotArrays | None = batch if isinstance(batch, BallbotArrays) else None
-        self._dtype = self._arrays.dtype if self._arrays else np.dtype(str(batch.dtype).rpartition(".")[2]).type
+        self._dtype = np.dtype(str(dtype).removeprefix("torch.")).type
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.history, self.observation = self.batch.history, self.batch.observation
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
@@ -164,24 +163,17 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         mask = _reset_mask(given_mask, self.num_envs)
         if self.batch.state is None:
             mask = np.ones_like(mask)
-        batch_mask: Any = self._to_batch(mask)
-        state = self.batch.initial_state(seed, batch_mask)
-        if constants is not None:
-            c: Any = self._constants(constants, state, mask)
-            state = self.batch.initial_state(seed, batch_mask, c=c)
-        if x is not None:
-            state = self._with_x(state, x, mask)
-        self.batch.state = state
-        observation, measured = _as_array(self.batch.observe(state)), self.batch.measurements(state)
+        batch: Any = self.batch
+        own, of_envs = batch._own, batch._own(mask)
+        state = batch.initial_state(seed, of_envs)
+        if x is not None or constants is not None:
+            c = None if constants is None else own(self._constants(constants, state, mask))
+            shape = self.num_envs, self.params.state_size
+            x = None if x is None else own(finite_array(x, shape, "state", broadcast=True).T.copy())
+            state = batch.initial_state(seed, of_envs, x, c)
+        batch.state = state
         self._ended = self._ended & ~mask
-        force, grip = (
-            np.zeros((rows, self.num_envs), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips)
-        )
-        cost, parts = np.zeros(self.num_envs), np.zeros((3, self.num_envs))
-        success, failure, clipped = np.zeros((3, self.num_envs), bool)
-        none = _filled(-1, self.num_envs)
-        info = _info_of(state, measured, none, cost, parts, force, success, failure, clipped, grip)
-        return observation.astype(np.float32, copy=False), _masked(info, mask)
+        return gymnasium_reset(batch, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -208,7 +200,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 'options={"reset_mask": mask}'
             )
         batch: Any = self.batch
-        result = self._arrays.step(actions, waiting) if self._arrays else step(batch, actions, waiting)
+        before = batch.state
+        result = gymnasium_step(batch, before, batch.advance(actions, waiting))
         if not batch.restarts:
             self._ended = result[2] | result[3]
         return result
@@ -263,36 +256,20 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("no state before reset()")
         return self.batch.state
 
-    def _to_batch(self, array: np.ndarray) -> Any:
-        """The array as the batch takes it."""
-        if self._arrays:
-            return array
-        import torch
-
-        batch: Any = self.batch
-        return torch.from_numpy(array).to(batch.device)
-
-    def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
-        """(nc, B) constants: those given, and drawn ones for the rest."""
+    def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> np.ndarray:
+        """(nc, B) constants: those given to the envs of the mask, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
         c = _as_array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
             task.check_constant_names(constants)
             for name, value in constants.items():
-                c[names.index(name)] = finite_array(value, (self.num_envs,), f"constant {name!r}", broadcast=True)
+                values = finite_array(value, (self.num_envs,), f"constant {name!r}", broadcast=True)
+                c[names.index(name), mask] = values[mask]
         else:
-            c[:] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True).T
+            c[:, mask] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True)[mask].T
         for distinct in np.unique(c[:, mask], axis=1).T:
             task.check_constants(distinct, self.params)
-        return self._to_batch(c.astype(_as_array(drawn.c).dtype))
-
-    def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
-        """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
-        drawn, c = _as_array(state.x), _as_array(state.c)
-        wanted = finite_array(given, (self.num_envs, self.params.state_size), "state", broadcast=True).T
-        x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
-        _check_starts(self.task, tuple(x), tuple(c), mask)
-        return state._replace(x=self._to_batch(x))
+        return c
 
 
 def _without_torch(
