@@ -124,10 +124,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics=...), or "async"'
             )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        arguments: Any = engine, task, num_envs, device, dtype, compile, params
-        given: Any = {"randomization": randomization, "history": history, "observation": observation}
-        batch = _without_torch(*arguments, **given) or _in_torch(*arguments, **given)
-        self.batch: BallbotBatch | BallbotArrays = batch
+        world = randomization, history, observation
+        self.batch = _made(engine, task, num_envs, device, dtype, compile, params, *world)
         self._dtype = np.dtype(str(dtype).removeprefix("torch.")).type
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.history, self.observation = self.batch.history, self.batch.observation
@@ -272,7 +270,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         return c
 
 
-def _without_torch(
+def _made(
     engine: str,
     task: Task,
     num_envs: int,
@@ -283,67 +281,42 @@ def _without_torch(
     randomization: Randomization | str | None,
     history: int,
     observation: str,
-) -> BallbotArrays | None:
-    """The envs in machine code or in NumPy, without an import of torch, which takes a second. None if torch is installed
-    and the arguments ask for it, or there is no machine code. The arguments are those of `BallbotVectorEnv`.
+) -> BallbotBatch | BallbotArrays:
+    """The batch. Torch, whose import takes a second, is imported only to be used. Arguments are those of `BallbotVectorEnv`.
 
     Raises:
         ModuleNotFoundError: torch is missing, and an argument asks for what torch alone computes.
         ValueError: as `BallbotVectorEnv`.
     """
-    varied, installed = Randomization.checked(randomization, params), find_spec("torch") is not None
-    plain = (
-        varied == Randomization()
-        and not check_history(history)
-        and check_observation(observation, params, varied) == "state"
-    )
+    varied = Randomization.checked(randomization, params)
+    history, observation = check_history(history), check_observation(observation, params, varied)
+    plain = varied == Randomization() and not history and observation == "state"
     on_cpu, precision = str(device).partition(":")[0] == "cpu", str(dtype).removeprefix("torch.")
-    light = engine in ("native", "numpy") or (engine == "auto" and compile == "auto")
-    if not (plain and on_cpu and light and precision in _DTYPES):
-        if installed:
-            return None
-        if plain and on_cpu and light:
-            raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
-        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
-    real = np.float32 if precision == "float32" else np.float64
-    if engine != "numpy":
+    installed, light = find_spec("torch") is not None, engine in ("native", "numpy")
+    if light and not on_cpu:
+        raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
+    if light and not plain:
+        raise ValueError(f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"')
+    if engine == "auto":
+        light = plain and on_cpu and compile == "auto" and (precision in _DTYPES or not installed)
+    if light and precision not in _DTYPES:
+        raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
+    real = np.float64 if precision == "float64" else np.float32
+    if light and engine != "numpy":
         try:
             return BallbotNative(task, num_envs, real, params, _threads())
         except (ImportError, NoMachineCodeError) as error:
             if engine == "native":
                 raise
             _log.warning("no machine code, so the envs are slower: %s", error)
-            if installed:
-                return None
-    return BallbotArrays(task, num_envs, real, params)
-
-
-def _in_torch(
-    engine: str,
-    task: Task,
-    num_envs: int,
-    device: str | torch.device,
-    dtype: torch.dtype | str,
-    compile: bool | str,
-    params: Robot,
-    **settings: Any,
-) -> BallbotBatch:
-    """The envs in torch. The arguments are those of `BallbotVectorEnv`.
-
-    Raises:
-        ValueError: as `BallbotVectorEnv`, or another engine does not support the arguments.
-    """
-    import torch
-
+    if engine == "numpy" or (light and not installed):
+        return BallbotArrays(task, num_envs, real, params)
+    if not installed:
+        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
     from ballbot_gym.vector.batch import BallbotBatch
 
-    light = engine in ("native", "numpy")
-    if light and torch.device(device).type != "cpu":
-        raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
-    batch = BallbotBatch(task, num_envs, device, dtype, False if light else compile, params, **settings)
-    if light:
-        raise ValueError(f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"')
-    return batch
+    world: Any = {"randomization": varied, "history": history, "observation": observation}
+    return BallbotBatch(task, num_envs, device, dtype, compile, params, **world)
 
 
 def _threads() -> int:
