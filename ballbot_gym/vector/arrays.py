@@ -10,12 +10,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from ballbot_gym import ops, seeding
+from ballbot_gym import seeding
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.robot import Randomization, Robot
-from ballbot_gym.step import FLAGS, PAY, StepState, step
+from ballbot_gym.step import FLAGS, PAY, StepState, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
-from ballbot_gym.vector.state import DONE_BY_STEPS, BatchState, BatchStep, _check_starts
+from ballbot_gym.vector.state import _DONE_BY_STEPS, BatchState, BatchStep, _check_starts
 
 State = Any
 """A `BatchState` whose fields are NumPy arrays."""
@@ -128,12 +128,11 @@ class BallbotArrays:
 
     def _start(self, which: np.ndarray, state: State, given: bool) -> None:
         """Starts episodes in some envs of a state, in place; their constants are drawn unless they are given."""
-        task, count = self.task, self.task.constant_draws
         key = seeding.key(state.seed[which], state.episode[which], 0)
-        z = seeding.uniforms(key, count + task.state_draws, self.dtype)
-        if not given:
-            state.c[:, which] = self._rows(task.draw_constants(z[:count], self.params), len(which))
-        state.x[:, which] = self._rows(task.start(z[count:], tuple(state.c[:, which]), self.params), len(which))
+        z = seeding.uniforms(key, start_draws(self.task, self.randomization, False), self.dtype)
+        c = tuple(state.c[:, which]) if given else None
+        made = start(self.task, self.params, self.randomization, z, c=c)
+        state.x[:, which], state.c[:, which] = (self._rows(part, len(which)) for part in (made.x, made.c))
 
     def _rows(self, parts: Sequence[Any], size: int) -> np.ndarray:
         """(n, B) array of n components. Some components may be single numbers."""
@@ -144,17 +143,18 @@ class BallbotArrays:
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and their measurements, a row (B,) each."""
-        x = tuple(state.x)
-        now = self.task.at(tuple(state.c), state.steps.astype(self.dtype) * self.dtype(self.task.control_dt))
-        seen = self._rows(ops.components(self.task.seen(x, now, self.params)), state.x.shape[1])
-        return seen, self._rows(self.params.measurements(x), state.x.shape[1])
+        now = self._step_state(state)
+        seen = observe(self.task, self.params, self.randomization, now)
+        return self._rows(seen, self.num_envs), self._rows(self.params.measurements(now.x), self.num_envs)
+
+    def _step_state(self, state: State) -> StepState:
+        return StepState(tuple(state.x), tuple(state.c), state.steps.astype(self.dtype))
 
     def _stepped(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[State, BatchStep]:
         """The state after a step, and what the step did."""
         check_finite(actions)
         task, params, size = self.task, self.params, self.num_envs
-        now = StepState(tuple(old.x), tuple(old.c), old.steps.astype(self.dtype))
-        made = step(task, params, self.randomization, now, tuple(actions.T))
+        made = step(task, params, self.randomization, self._step_state(old), tuple(actions.T))
         did, end = made.outcome, self._rows(made.state.x, size)
         flags = np.empty((len(FLAGS), size), bool)
         for row, part in zip(
@@ -197,7 +197,7 @@ class BallbotArrays:
             "final_measured": last_measured,
         }
         if waiting is not None:
-            for name in DONE_BY_STEPS:
+            for name in _DONE_BY_STEPS:
                 result[name][..., waiting] = 0
             result["violated"][waiting] = -1
         return new, BatchStep(**result)

@@ -21,7 +21,7 @@ Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 """What `BallbotVectorEnv.step` returns."""
 
 
-def gymnasium_step(batch: BallbotBatch | BallbotArrays, before: BatchState, did: BatchStep) -> Step:
+def _gymnasium_step(batch: BallbotBatch | BallbotArrays, before: BatchState, did: BatchStep) -> Step:
     """What Gymnasium's `step` returns, with masks in its infos.
 
     Args:
@@ -44,7 +44,7 @@ def gymnasium_step(batch: BallbotBatch | BallbotArrays, before: BatchState, did:
     return seen, step.reward, step.terminated, step.truncated, infos
 
 
-def gymnasium_reset(batch: BallbotBatch | BallbotArrays, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+def _gymnasium_reset(batch: BallbotBatch | BallbotArrays, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     """What Gymnasium's `reset` returns of a batch, in which the envs of the mask (B,) have just begun."""
     state: Any = batch.state
     size, rows = batch.num_envs, (batch.params.action_size, 4 * batch.params.grips)

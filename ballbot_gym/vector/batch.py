@@ -29,7 +29,7 @@ from ballbot_gym.robot import (
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import FLAGS, Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
-from ballbot_gym.vector.state import DONE_BY_STEPS, BatchState, BatchStep, _check_starts
+from ballbot_gym.vector.state import _DONE_BY_STEPS, BatchState, BatchStep, _check_starts
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -272,7 +272,7 @@ class BallbotBatch:
         wait = self._own(waiting)
         self.state = BatchState(*(torch.where(wait, a, b) for a, b in zip(begun, cast(Any, self.state), strict=True)))
         return did._replace(
-            **{name: getattr(did, name).masked_fill(wait, 0) for name in DONE_BY_STEPS},
+            **{name: getattr(did, name).masked_fill(wait, 0) for name in _DONE_BY_STEPS},
             violated=did.violated.masked_fill(wait, -1),
             observation=torch.where(wait[:, None], self.observe(self.state), did.observation),
             measured=self.measurements(self.state),

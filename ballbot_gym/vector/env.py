@@ -31,7 +31,7 @@ from ballbot_gym.robot import PAPER, Randomization, Robot
 from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.arrays import BallbotArrays
-from ballbot_gym.vector.autoreset import _as_array, gymnasium_reset, gymnasium_step
+from ballbot_gym.vector.autoreset import _as_array, _gymnasium_reset, _gymnasium_step
 from ballbot_gym.vector.native import BallbotNative
 from ballbot_gym.vector.state import BatchState
 
@@ -171,7 +171,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             state = batch.initial_state(seed, of_envs, x, c)
         batch.state = state
         self._ended = self._ended & ~mask
-        return gymnasium_reset(batch, mask)
+        return _gymnasium_reset(batch, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -199,7 +199,7 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             )
         batch: Any = self.batch
         before = batch.state
-        result = gymnasium_step(batch, before, batch.advance(actions, waiting))
+        result = _gymnasium_step(batch, before, batch.advance(actions, waiting))
         if not batch.restarts:
             self._ended = result[2] | result[3]
         return result

@@ -74,7 +74,7 @@ class BatchStep(NamedTuple):
     """(nm, B) the same after the step and before any reset."""
 
 
-DONE_BY_STEPS = (
+_DONE_BY_STEPS = (
     *("reward", "reward_parts", "cost", "terminated", "truncated", "success", "failure"),
     *("force", "clipped", "grip"),
 )
