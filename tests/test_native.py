@@ -91,7 +91,7 @@ def test_what_a_step_returned_never_changes_later_though_memory_is_used_again():
     for array, copied in kept:
         np.testing.assert_array_equal(array, copied)
     assert len(kept) > 500
-    assert len(addresses) < 100  # each step would have its own if memory were not used again
+    assert len(addresses) < 150  # each of the 200 steps would have its own if memory were not used again
 
 
 @needs_compiler
@@ -177,7 +177,7 @@ def test_a_state_of_another_shape_is_refused_before_machine_code_reads_it():
     envs.state = state._replace(x=np.asfortranarray(state.x, np.float64))  # another order and type are taken
     first = envs.step(np.zeros((3, 2), np.float32, order="F"))
     envs.state = state
-    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F"))[4]["state"], first[4]["state"])
+    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F")).final_x, first.final_x)
 
 
 @needs_compiler

@@ -278,6 +278,21 @@ def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of
         np.testing.assert_allclose(many.step(np.tile(action, (2, 1)))[0][0], wanted, atol=1e-5)
 
 
+def test_history_and_sensors_of_a_vector_env_begin_in_the_state_that_is_given():
+    state = np.zeros(8)
+    many = BallbotVectorEnv(2, engine="torch", compile=False, history=1)
+    seen, _ = many.reset(seed=0, options={"state": state})
+    own = len(many.task.observation_scale)
+    np.testing.assert_array_equal(seen[:, own : 2 * own], seen[:, :own])
+    settings = {"robot": "omni", "observation": "sensors", "compile": False}
+    many, batch = BallbotVectorEnv(2, engine="torch", **settings), BallbotBatch(num_envs=2, **settings)
+    x = np.zeros(batch.params.state_size)
+    x[3] = 0.2
+    seen, _ = many.reset(seed=0, options={"state": x})
+    given = torch.as_tensor(np.tile(x[:, None], 2), dtype=torch.float32)
+    np.testing.assert_array_equal(seen, batch.reset(0, x=given))
+
+
 def test_history_of_an_ended_episode_is_forgotten(make_env):
     env = make_env(physics="rk4", history=1)
     own = len(env.task.observation_scale)

@@ -78,15 +78,11 @@ def play(task):
         with torch.no_grad():
             actions = [policy(x[:, part], seen[part], rng) for policy, part in zip(chosen.values(), parts, strict=True)]
         before = tuple(envs.state.x)
-        observation, reward, terminated, truncated, info = envs.step(torch.cat(actions).double().numpy())
-        ended = terminated | truncated
-        at_end = info.get("final_info", info)  # an env that ends is in its next episode
-        force, failure, violated = (
-            np.where(ended, at_end[name].T, info[name].T) for name in ("force", "failure", "violated")
-        )
-        gain = (task.survival_reward - task.cost(before, tuple(force), c)) * task.control_dt
-        steps.append(np.where(running, [gain, reward, failure, violated], math.nan))
-        running = running & ~ended
+        did = envs.step(torch.cat(actions).double().numpy())
+        observation = did.observation
+        gain = (task.survival_reward - task.cost(before, tuple(did.force), c)) * task.control_dt
+        steps.append(np.where(running, [gain, did.reward, did.failure, did.violated], math.nan))
+        running = running & ~(did.terminated | did.truncated)
     assert not running.any()
     gains, rewards, failures, violated = np.stack(steps, 1)
     return {

@@ -97,12 +97,12 @@ void ballbot_observe(int64_t B, int64_t count, const int64_t *which, const int64
 /* Robots that a thread takes at once. */
 enum { CHUNK = 32 * LANES };
 
-/* Rows of what is reported of a robot: state, measurements, force, the floor's grip. */
-enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, REPORTED = GRIPPED + GRIP };
+/* Rows of a step: state and measurements after it, what it applied: force and the floor's grip, and the observation after it. */
+enum { MEASUREMENTS = STATES, FORCE = STATES + MEASURED, GRIPPED = FORCE + ACTIONS, SIGHT = GRIPPED + GRIP, ROWS = SIGHT + SEEN };
 
-/* Rows of flags, which are those of step.FLAGS and one more; and of pay, which are those of step.PAY. */
-enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
-enum { REWARD, COST, SURVIVE, RUNNING, GOAL, PAYS };
+/* Rows of flags, which are those of step.FLAGS; and how many there are of pay, which are those of step.PAY. */
+enum { TERMINATED, TRUNCATED };
+enum { PAYS = 5 };
 
 /* Rows of counts: the violated limit, and the steps and the episode of the robot now. */
 enum { VIOLATED, STEPS, EPISODE };
@@ -116,16 +116,14 @@ typedef struct {
     int64_t env, component; /* how far apart the actions of robots are, and the components of one, in numbers */
     const real *x, *c, *action;
     const int64_t *steps, *episode, *seed;
-    const uint8_t *idle;     /* whose action is ignored, and whose next episode begins; null where there are none */
-    int64_t begins, restarts; /* whether episodes begin; and whether they do where others end */
-    real *reported, *seen;   /* REPORTED and SEEN rows */
-    double *pay;             /* PAYS rows */
-    uint8_t *flags;          /* 6 rows */
-    int64_t *counts;         /* 3 rows; the last is written where episodes begin, */
-    real *new_c;             /* and so is this */
-    float *end_seen;         /* a row for each robot, written where an episode ends; null unless restarts. If it is not
-                                null, the reports of ended episodes are kept too: `reported` then has REPORTED more
-                                rows, pay has COST to GOAL again, and flags has SUCCESS to CLIPPED again. */
+    const uint8_t *idle; /* whose action is ignored, and whose next episode begins; null where there are none */
+    int64_t restarts;    /* whether episodes begin where others end */
+    real *end;           /* ROWS */
+    real *now, *seen;    /* state and measurements, and observations, once episodes have begun; unless restarts, those of end */
+    real *new_c;         /* CONSTANTS rows of the episodes then */
+    double *pay;         /* PAYS rows */
+    uint8_t *flags;      /* FLAGS rows */
+    int64_t *counts;     /* 3 rows */
 } Memory;
 
 /* Writes the rewards, costs and flags of robots n to n + count - 1. If count is a constant, the compiler makes SIMD of it. */
@@ -147,15 +145,13 @@ static inline __attribute__((always_inline)) void write_outcome(const Memory *m,
             flags[i * B + k] = (uint8_t)(marks[i * LANES + k] != 0);
     for (int64_t k = 0; k < count; ++k)
         flags[TRUNCATED * B + k] |= (uint8_t)(!flags[TERMINATED * B + k] & (counts[STEPS * B + k] >= m->most));
-    for (int64_t k = 0; k < count; ++k)
-        flags[DONE * B + k] = flags[TERMINATED * B + k] | flags[TRUNCATED * B + k];
 }
 
 /* One control step of robots n to n + count - 1, at most LANES, and what they see then; no episode begins. */
 static void step_block(Memory *m, int64_t n, int64_t count) {
     const int64_t B = m->B;
     const real *const action = m->action + n * m->env;
-    real *const reported = m->reported + n;
+    real *const end = m->end + n;
     real taken[LANES] = {0}, after[LANES] = {0}, acts[ACTIONS * LANES] = {0}, paid[PAYS * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
     for (int64_t k = 0; k < count; ++k) {
         for (int i = 0; i < ACTIONS; ++i)
@@ -168,20 +164,19 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     if (!(off == 0))
         __atomic_store_n(&m->bad, 1, __ATOMIC_RELAXED);
     if (count == LANES) {
-        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, reported, B, reported + FORCE * B, B,
-                reported + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
-        look(reported, B, m->c + n, B, after, LANES, m->seen + n, B, reported + MEASUREMENTS * B, B);
+        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, end, B, end + FORCE * B, B,
+                end + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
+        look(end, B, m->c + n, B, after, LANES, end + SIGHT * B, B, end + MEASUREMENTS * B, B);
         write_outcome(m, n, LANES, paid, marks, limit);
     } else {
-        real in[(STATES + CONSTANTS) * LANES] = {0}, out[(REPORTED + SEEN) * LANES];
-        real *const cs = in + STATES * LANES, *const ss = out + REPORTED * LANES;
+        real in[(STATES + CONSTANTS) * LANES] = {0}, out[ROWS * LANES];
+        real *const cs = in + STATES * LANES;
         rows_copy(STATES, count, m->x + n, B, in, LANES);
         rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
         advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
                 out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
-        look(out, LANES, cs, LANES, after, LANES, ss, LANES, out + MEASUREMENTS * LANES, LANES);
-        rows_copy(REPORTED, count, out, LANES, reported, B);
-        rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
+        look(out, LANES, cs, LANES, after, LANES, out + SIGHT * LANES, LANES, out + MEASUREMENTS * LANES, LANES);
+        rows_copy(ROWS, count, out, LANES, end, B);
         write_outcome(m, n, count, paid, marks, limit);
     }
 }
@@ -196,37 +191,28 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
     int64_t *const steps = m->counts + STEPS * B, *const episode = m->counts + EPISODE * B;
     for (int64_t n = first; n < last; n += LANES)
         step_block(m, n, last - n < LANES ? last - n : LANES);
-    if (!m->begins)
-        return;
     rows_copy(CONSTANTS, size, m->c + first, B, m->new_c + first, B);
     memcpy(episode + first, m->episode + first, size * sizeof *episode);
     if (m->restarts) {
-        rows_copy(REPORTED, size, m->reported + first, B, m->reported + REPORTED * B + first, B);
-        for (int i = COST; i <= GOAL; ++i)
-            memcpy(m->pay + (i + GOAL) * B + first, m->pay + i * B + first, size * sizeof *m->pay);
-        for (int i = SUCCESS; i <= CLIPPED; ++i)
-            memcpy(m->flags + (i + DONE + 1 - SUCCESS) * B + first, m->flags + i * B + first, size);
+        rows_copy(FORCE, size, m->end + first, B, m->now + first, B);
+        rows_copy(SEEN, size, m->end + SIGHT * B + first, B, m->seen + first, B);
     }
     for (int64_t n = first; n < last; ++n) {
-        if (m->idle && m->idle[n]) {
-            CLEAR(GOAL + 1, m->pay);
-            CLEAR(DONE + 1, m->flags);
+        const int idle = m->idle && m->idle[n];
+        if (idle) {
+            CLEAR(SIGHT - FORCE, m->end + FORCE * B);
+            CLEAR(PAYS, m->pay);
+            CLEAR(FLAGS, m->flags);
             m->counts[VIOLATED * B + n] = -1;
-        } else if (m->restarts && m->flags[DONE * B + n]) {
-            for (int i = 0; i < SEEN; ++i)
-                m->end_seen[n * SEEN + i] = (float)m->seen[i * B + n];
-            CLEAR(4, m->pay + COST * B);
-            CLEAR(3, m->flags + SUCCESS * B);
-        } else {
-            continue;
         }
-        CLEAR(REPORTED - FORCE, m->reported + FORCE * B);
-        steps[n] = 0;
-        episode[n] += 1;
-        begun[count++] = n;
+        if (idle || (m->restarts && (m->flags[TERMINATED * B + n] | m->flags[TRUNCATED * B + n]))) {
+            steps[n] = 0;
+            episode[n] += 1;
+            begun[count++] = n;
+        }
     }
-    ballbot_start(B, count, begun, m->seed, episode, 0, m->reported, m->new_c);
-    ballbot_observe(B, count, begun, steps, m->reported, m->new_c, m->seen, m->reported + MEASUREMENTS * B);
+    ballbot_start(B, count, begun, m->seed, episode, 0, m->now, m->new_c);
+    ballbot_observe(B, count, begun, steps, m->now, m->new_c, m->seen, m->now + MEASUREMENTS * B);
 }
 
 /* One control step of a batch. Threads that call it with the same memory take chunks in turns, until all are done. */

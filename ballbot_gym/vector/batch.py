@@ -11,7 +11,7 @@ import logging
 import shutil
 import types
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,7 @@ from ballbot_gym.robot import (
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import FLAGS, Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
-from ballbot_gym.vector.state import BatchState, _check_starts
+from ballbot_gym.vector.state import _DONE_BY_STEPS, BatchState, BatchStep, _check_starts
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -55,40 +55,6 @@ _FIXED = ("task", "params", "randomization", "history", "observation", "num_envs
 
 _Rows = Any
 """A `BatchState` in which each matrix is a tuple of its rows (B,). Everything is computed in this form."""
-
-
-class BatchStep(NamedTuple):
-    """The result of one control step of B environments. Environments whose episode ended have started the next one."""
-
-    observation: torch.Tensor
-    """(B, no) observations. Where an episode ended, the first one of the next episode."""
-    reward: torch.Tensor
-    """(B,) reward of the step: survival_reward · control_dt minus the running cost, plus the reward at a first exit."""
-    reward_parts: torch.Tensor
-    """(3, B) parts of the reward, which add up to it: for living, for the cost, and at the goal."""
-    cost: torch.Tensor
-    """(B,) cost of the step, the price of a failure included."""
-    terminated: torch.Tensor
-    """(B,) bool."""
-    truncated: torch.Tensor
-    """(B,) bool."""
-    final_observation: torch.Tensor
-    """(B, no) observations after the step and before any reset."""
-    final_x: torch.Tensor
-    """(8, B) states after the step and before any reset."""
-    success: torch.Tensor
-    """(B,) bool: the episode ended in the goal."""
-    failure: torch.Tensor
-    """(B,) bool: the episode ended at a violated limit."""
-    violated: torch.Tensor
-    """(B,) int64 index in the batch's `limit_names` of the first limit violated, else −1."""
-    force: torch.Tensor
-    """(2, B) N, what the actuator applied."""
-    clipped: torch.Tensor
-    """(B,) bool: the action was outside [−1, 1]."""
-    grip: torch.Tensor
-    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction that the step needs; (0, B)
-    where friction is unlimited. It carries no gradient."""
 
 
 class BallbotBatch:
@@ -290,6 +256,33 @@ class BallbotBatch:
         self._proven = True
         return _typed(result)
 
+    @torch.no_grad()
+    def advance(self, actions: np.ndarray, waiting: np.ndarray | None = None) -> BatchStep:
+        """`step` for vector envs: without gradients, and some envs may start their next episode instead.
+
+        Args:
+            actions: (B, 2), same as in `step`.
+            waiting: (B,) bool, the envs that ignore their action and start their next episode, in which they do nothing yet;
+                None if there are none.
+        """
+        begun = None if waiting is None else self.initial_state(None, self._own(waiting))
+        did = self.step(self._own(np.asarray(actions, order="F")))  # components contiguous, as everything in the batch
+        if begun is None:
+            return did
+        wait = self._own(waiting)
+        self.state = BatchState(*(torch.where(wait, a, b) for a, b in zip(begun, cast(Any, self.state), strict=True)))
+        return did._replace(
+            **{name: getattr(did, name).masked_fill(wait, 0) for name in _DONE_BY_STEPS},
+            violated=did.violated.masked_fill(wait, -1),
+            observation=torch.where(wait[:, None], self.observe(self.state), did.observation),
+            measured=self.measurements(self.state),
+        )
+
+    def _own(self, values: Any) -> torch.Tensor:
+        """Numbers or truth values as the batch computes with them."""
+        given = torch.as_tensor(values, device=self.device)
+        return given if given.dtype == torch.bool else given.to(self.dtype)
+
     def transition(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
         """One control step of every env, and the start of the next episode where one ended; a pure function.
 
@@ -320,12 +313,12 @@ class BallbotBatch:
             tried = (part.clamp(-1.0, 1.0) for part in asked)
             past = (*self._seen(now), *tried, *past)[: len(past)]
         after = now._replace(x=end, steps=steps, actuator=made.state.actuator, past=past, sensors=made.state.sensors)
-        new, observed = after, self._observe(after)
-        observation = observed
+        new, observed, measured = after, self._observe(after), self._measured(end)
+        observation, new_measured = observed, measured
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
         if self.restarts and (torch.compiler.is_compiling() or bool(done.any())):
             new = _select(done, self._start(state.seed, state.episode + 1), after)
-            observation = self._observe(new)
+            observation, new_measured = self._observe(new), self._measured(new.x)
         result = BatchStep(
             observation=observation,
             reward=did.reward,
@@ -340,9 +333,9 @@ class BallbotBatch:
             violated=did.violated,
             force=torch.stack(made.force),
             clipped=torch.where(made.clipped, 1.0, 0.0),
-            grip=torch.stack(made.grip)
-            if made.grip
-            else torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device),
+            grip=self._stack(made.grip, end[0]),
+            measured=new_measured,
+            final_measured=measured,
         )
         return self._stacked(new), result
 
@@ -369,11 +362,13 @@ class BallbotBatch:
 
         return torch.compile(slope, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
-    def measurements(self, state: BatchState) -> dict[str, np.ndarray]:
-        """(B,) what the robot measures in a state, by name. It carries no gradient."""
-        with torch.no_grad():
-            values = self.params.measurements(state.x.detach().unbind(0))
-        return self.params.named_measurements(value.cpu().numpy() for value in values)
+    def measurements(self, state: BatchState) -> torch.Tensor:
+        """(nm, B) what the robot measures in a state, as its `MEASUREMENTS` name it. It carries no gradient."""
+        return self._measured(state.x.unbind(0))
+
+    @torch.no_grad()
+    def _measured(self, x: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        return self._stack(self.params.measurements(x), x[0])
 
     def model(self, drawn: tuple[torch.Tensor, ...]) -> Robot:
         """The robots for whose episodes the randomization drew this, (B,) each, as one whose numbers are (B,)."""
@@ -425,10 +420,11 @@ class BallbotBatch:
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""
-        none = torch.zeros(0, *rows.seed.shape, dtype=self.dtype, device=rows.seed.device)
-        return BatchState(
-            *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
-        )
+        return BatchState(*(self._stack(part, rows.seed) if isinstance(part, tuple) else part for part in rows))
+
+    def _stack(self, parts: tuple[torch.Tensor, ...], like: torch.Tensor) -> torch.Tensor:
+        """(n, B) tensor of n components, of which each has the shape of `like`."""
+        return torch.stack(parts) if parts else torch.zeros(0, *like.shape, dtype=self.dtype, device=like.device)
 
 
 def _typed(result: BatchStep) -> BatchStep:

@@ -31,9 +31,9 @@ from ballbot_gym.robot import PAPER, Randomization, Robot
 from ballbot_gym.step import check_observation, observation_space
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector.arrays import BallbotArrays
-from ballbot_gym.vector.autoreset import _as_array, _filled, _info_of, _masked, step
+from ballbot_gym.vector.autoreset import _as_array, _gymnasium_reset, _gymnasium_step
 from ballbot_gym.vector.native import BallbotNative
-from ballbot_gym.vector.state import BatchState, _check_starts
+from ballbot_gym.vector.state import BatchState
 
 if TYPE_CHECKING:
     import torch
@@ -124,12 +124,9 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics=...), or "async"'
             )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        arguments: Any = engine, task, num_envs, device, dtype, compile, params
-        given: Any = {"randomization": randomization, "history": history, "observation": observation}
-        batch = _without_torch(*arguments, **given) or _in_torch(*arguments, **given)
-        self.batch: BallbotBatch | BallbotArrays = batch
-        self._arrays: BallbotArrays | None = batch if isinstance(batch, BallbotArrays) else None
-        self._dtype = self._arrays.dtype if self._arrays else np.dtype(str(batch.dtype).rpartition(".")[2]).type
+        world = randomization, history, observation
+        self.batch = _made(engine, task, num_envs, device, dtype, compile, params, *world)
+        self._dtype = np.dtype(str(dtype).removeprefix("torch.")).type
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.history, self.observation = self.batch.history, self.batch.observation
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
@@ -164,24 +161,17 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
         mask = _reset_mask(given_mask, self.num_envs)
         if self.batch.state is None:
             mask = np.ones_like(mask)
-        batch_mask: Any = self._to_batch(mask)
-        state = self.batch.initial_state(seed, batch_mask)
-        if constants is not None:
-            c: Any = self._constants(constants, state, mask)
-            state = self.batch.initial_state(seed, batch_mask, c=c)
-        if x is not None:
-            state = self._with_x(state, x, mask)
-        self.batch.state = state
-        observation, measured = _as_array(self.batch.observe(state)), self.batch.measurements(state)
+        batch: Any = self.batch
+        own, of_envs = batch._own, batch._own(mask)
+        state = batch.initial_state(seed, of_envs)
+        if x is not None or constants is not None:
+            c = None if constants is None else own(self._constants(constants, state, mask))
+            shape = self.num_envs, self.params.state_size
+            x = None if x is None else own(finite_array(x, shape, "state", broadcast=True).T.copy())
+            state = batch.initial_state(seed, of_envs, x, c)
+        batch.state = state
         self._ended = self._ended & ~mask
-        force, grip = (
-            np.zeros((rows, self.num_envs), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips)
-        )
-        cost, parts = np.zeros(self.num_envs), np.zeros((3, self.num_envs))
-        success, failure, clipped = np.zeros((3, self.num_envs), bool)
-        none = _filled(-1, self.num_envs)
-        info = _info_of(state, measured, none, cost, parts, force, success, failure, clipped, grip)
-        return observation.astype(np.float32, copy=False), _masked(info, mask)
+        return _gymnasium_reset(batch, mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -208,7 +198,8 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
                 'options={"reset_mask": mask}'
             )
         batch: Any = self.batch
-        result = self._arrays.step(actions, waiting) if self._arrays else step(batch, actions, waiting)
+        before = batch.state
+        result = _gymnasium_step(batch, before, batch.advance(actions, waiting))
         if not batch.restarts:
             self._ended = result[2] | result[3]
         return result
@@ -263,39 +254,23 @@ class BallbotVectorEnv(TaskEnv, gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("no state before reset()")
         return self.batch.state
 
-    def _to_batch(self, array: np.ndarray) -> Any:
-        """The array as the batch takes it."""
-        if self._arrays:
-            return array
-        import torch
-
-        batch: Any = self.batch
-        return torch.from_numpy(array).to(batch.device)
-
-    def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
-        """(nc, B) constants: those given, and drawn ones for the rest."""
+    def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> np.ndarray:
+        """(nc, B) constants: those given to the envs of the mask, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
         c = _as_array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
             task.check_constant_names(constants)
             for name, value in constants.items():
-                c[names.index(name)] = finite_array(value, (self.num_envs,), f"constant {name!r}", broadcast=True)
+                values = finite_array(value, (self.num_envs,), f"constant {name!r}", broadcast=True)
+                c[names.index(name), mask] = values[mask]
         else:
-            c[:] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True).T
+            c[:, mask] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True)[mask].T
         for distinct in np.unique(c[:, mask], axis=1).T:
             task.check_constants(distinct, self.params)
-        return self._to_batch(c.astype(_as_array(drawn.c).dtype))
-
-    def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
-        """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
-        drawn, c = _as_array(state.x), _as_array(state.c)
-        wanted = finite_array(given, (self.num_envs, self.params.state_size), "state", broadcast=True).T
-        x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
-        _check_starts(self.task, tuple(x), tuple(c), mask)
-        return state._replace(x=self._to_batch(x))
+        return c
 
 
-def _without_torch(
+def _made(
     engine: str,
     task: Task,
     num_envs: int,
@@ -306,67 +281,42 @@ def _without_torch(
     randomization: Randomization | str | None,
     history: int,
     observation: str,
-) -> BallbotArrays | None:
-    """The envs in machine code or in NumPy, without an import of torch, which takes a second. None if torch is installed
-    and the arguments ask for it, or there is no machine code. The arguments are those of `BallbotVectorEnv`.
+) -> BallbotBatch | BallbotArrays:
+    """The batch. Torch, whose import takes a second, is imported only to be used. Arguments are those of `BallbotVectorEnv`.
 
     Raises:
         ModuleNotFoundError: torch is missing, and an argument asks for what torch alone computes.
         ValueError: as `BallbotVectorEnv`.
     """
-    varied, installed = Randomization.checked(randomization, params), find_spec("torch") is not None
-    plain = (
-        varied == Randomization()
-        and not check_history(history)
-        and check_observation(observation, params, varied) == "state"
-    )
+    varied = Randomization.checked(randomization, params)
+    history, observation = check_history(history), check_observation(observation, params, varied)
+    plain = varied == Randomization() and not history and observation == "state"
     on_cpu, precision = str(device).partition(":")[0] == "cpu", str(dtype).removeprefix("torch.")
-    light = engine in ("native", "numpy") or (engine == "auto" and compile == "auto")
-    if not (plain and on_cpu and light and precision in _DTYPES):
-        if installed:
-            return None
-        if plain and on_cpu and light:
-            raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
-        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
-    real = np.float32 if precision == "float32" else np.float64
-    if engine != "numpy":
+    installed, light = find_spec("torch") is not None, engine in ("native", "numpy")
+    if light and not on_cpu:
+        raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
+    if light and not plain:
+        raise ValueError(f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"')
+    if engine == "auto":
+        light = plain and on_cpu and compile == "auto" and (precision in _DTYPES or not installed)
+    if light and precision not in _DTYPES:
+        raise ValueError(f"dtype must be 'float32' or 'float64', not {dtype!r}")
+    real = np.float64 if precision == "float64" else np.float32
+    if light and engine != "numpy":
         try:
             return BallbotNative(task, num_envs, real, params, _threads())
         except (ImportError, NoMachineCodeError) as error:
             if engine == "native":
                 raise
             _log.warning("no machine code, so the envs are slower: %s", error)
-            if installed:
-                return None
-    return BallbotArrays(task, num_envs, real, params)
-
-
-def _in_torch(
-    engine: str,
-    task: Task,
-    num_envs: int,
-    device: str | torch.device,
-    dtype: torch.dtype | str,
-    compile: bool | str,
-    params: Robot,
-    **settings: Any,
-) -> BallbotBatch:
-    """The envs in torch. The arguments are those of `BallbotVectorEnv`.
-
-    Raises:
-        ValueError: as `BallbotVectorEnv`, or another engine does not support the arguments.
-    """
-    import torch
-
+    if engine == "numpy" or (light and not installed):
+        return BallbotArrays(task, num_envs, real, params)
+    if not installed:
+        raise missing('engine="torch", device, compile, randomization, history or sensors', "torch", "train")
     from ballbot_gym.vector.batch import BallbotBatch
 
-    light = engine in ("native", "numpy")
-    if light and torch.device(device).type != "cpu":
-        raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
-    batch = BallbotBatch(task, num_envs, device, dtype, False if light else compile, params, **settings)
-    if light:
-        raise ValueError(f'engine="{engine}" does not support Randomization, history or sensors; take engine="torch"')
-    return batch
+    world: Any = {"randomization": varied, "history": history, "observation": observation}
+    return BallbotBatch(task, num_envs, device, dtype, compile, params, **world)
 
 
 def _threads() -> int:

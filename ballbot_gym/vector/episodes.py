@@ -54,78 +54,30 @@ def run_episodes(
         drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
         margins: whether to find `BatchEpisodes.margin`, which takes up to a sixth longer.
     """
-    device: Any = "cpu" if isinstance(batch, BallbotArrays) else batch.device
-    observation = _begun(batch, x, c, drawn)
-    running = torch.ones(batch.num_envs, dtype=torch.bool, device=device)
-    success = torch.zeros_like(running)
-    cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=device)
-    steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=device)
-    violated = torch.full_like(steps, -1)
-    assert batch.state is not None
-    task, end, constants = batch.task, torch.as_tensor(batch.state.x), torch.as_tensor(batch.state.c).unbind(0)
+    envs: Any = batch
+    given = (None if part is None else envs._own(part.T) for part in (x, c, drawn))
+    envs.state = state = envs.initial_state(0, None, *given)
+    observation = torch.as_tensor(envs.observe(state))
+    task, end, constants = batch.task, torch.as_tensor(state.x), torch.as_tensor(state.c).unbind(0)
+    steps = torch.zeros_like(end[0], dtype=torch.int64)
+    running, cost = torch.ones_like(steps, dtype=torch.bool), torch.zeros_like(steps, dtype=torch.float64)
+    success, violated = ~running, torch.full_like(steps, -1)
     margin = torch.full_like(end[0], torch.inf)
     for _ in range(task.steps):
-        result = _stepped(batch, policy(observation))
+        did = envs.step(envs._own(policy(observation)))
+        result = did._make(map(torch.as_tensor, did))
         observation = result.observation
         cost += torch.where(running, result.cost, 0.0)
         steps += running
         success |= running & result.success
         violated = torch.where(running & result.failure, result.violated, violated)
-        end = torch.where(running, result.x, end)
+        end = torch.where(running, result.final_x, end)
         if margins:
             now = task.at(constants, steps.to(end.dtype) * task.control_dt)
             margin = functools.reduce(torch.minimum, task.margins(end.unbind(0), now), margin)
-        running &= ~result.ended
+        running &= ~(result.terminated | result.truncated)
         if not running.any():
             break
     c_end = task.at(constants, steps.to(end.dtype) * task.control_dt)
     goal_error = task.goal_error(end.unbind(0), c_end)
     return BatchEpisodes(cost, success, violated >= 0, violated, steps, goal_error, margin)
-
-
-class _Stepped(NamedTuple):
-    """What a step did in B environments, before those that ended began anew."""
-
-    observation: torch.Tensor
-    """(B, no), of the next episode where one ended."""
-    x: torch.Tensor
-    """(n, B)."""
-    cost: torch.Tensor
-    """(B,)."""
-    success: torch.Tensor
-    """(B,) bool."""
-    failure: torch.Tensor
-    """(B,) bool."""
-    violated: torch.Tensor
-    """(B,) int64."""
-    ended: torch.Tensor
-    """(B,) bool."""
-
-
-def _begun(batch: BallbotBatch | BallbotArrays, x: Any, c: Any, drawn: Any) -> torch.Tensor:
-    """Observations (B, no) of given starts (B, 8), constants (B, nc) and draws."""
-    if isinstance(batch, BallbotArrays):
-        if drawn is not None:
-            raise ValueError("nothing is drawn in machine code; make a BallbotBatch")
-        starts, constants = (np.asarray(part, batch.dtype).T for part in (x, c))
-        batch.state = batch.initial_state(0, c=constants)._replace(x=starts)
-        return torch.from_numpy(batch.observe(batch.state))
-    kind: Any = {"dtype": batch.dtype, "device": batch.device}
-    return batch.reset(0, None, *(None if part is None else torch.as_tensor(part.T, **kind) for part in (x, c, drawn)))
-
-
-def _stepped(batch: BallbotBatch | BallbotArrays, actions: torch.Tensor) -> _Stepped:
-    if isinstance(batch, BallbotBatch):
-        did = batch.step(actions)
-        ended = did.terminated | did.truncated
-        return _Stepped(did.observation, did.final_x, did.cost, did.success, did.failure, did.violated, ended)
-    observation, _, terminated, truncated, infos = batch.step(actions.numpy().astype(batch.dtype))
-    ended = terminated | truncated
-    # what a step did is in final_info for the episodes that it ended, and else in the info
-    end = infos.get("final_info", infos)
-    did = {
-        name: torch.from_numpy(np.where(ended, end[name].T, infos[name].T))
-        for name in ("cost", "success", "failure", "violated")
-    }
-    x = torch.from_numpy(np.where(ended, end["state"].T, infos["state"].T))
-    return _Stepped(torch.from_numpy(observation), x, **did, ended=torch.from_numpy(ended))

@@ -6,6 +6,7 @@ bit-identical for any size of the batch and any place of the env in it.
 """
 
 import ctypes
+import itertools
 import os
 from functools import cache
 from importlib.util import find_spec
@@ -16,11 +17,14 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import machine_code
+from ballbot_gym.checks import check_finite
 from ballbot_gym.machine_code import NoMachineCodeError
 from ballbot_gym.robot import Robot
+from ballbot_gym.step import FLAGS, PAY
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_digest
-from ballbot_gym.vector.arrays import FLAG_ROWS, BallbotArrays, Computed, State
+from ballbot_gym.vector.arrays import BallbotArrays, State
+from ballbot_gym.vector.state import BatchStep
 
 # With GCC, -O3 takes half as much time again, and steps of large batches of robots without wheels take 6 to 8 % longer.
 _COMPILER_FLAGS = (
@@ -60,7 +64,10 @@ class BallbotNative(BallbotArrays):
         super().__init__(task, num_envs, dtype, params)
         self.threads = threads
         self._code = code or _code(task, params, dtype is np.float64)
-        self._kinds = [self._written(restarts) for restarts in (False, True)]
+        self._all = np.arange(self.num_envs)
+        acted = params.action_size, 4 * params.grips
+        rows = params.state_size, len(params.MEASUREMENTS), *acted, task.observation_size(params)
+        self._rows_end = list(itertools.accumulate(rows))  # of what a step computes
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_code": None}
@@ -74,38 +81,56 @@ class BallbotNative(BallbotArrays):
         arrays = _pointers(which, state.seed, state.episode)
         self._code.ballbot_start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
 
-    def _computed(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[Computed, bool]:
-        """What a step from a state computes, and whether an action is not finite."""
-        made = [np.empty(*kind) for kind in self._kinds[self.restarts]]
-        if any(stride % actions.itemsize for stride in actions.strides):
+    def _stepped(self, old: State, actions: np.ndarray, waiting: np.ndarray | None) -> tuple[State, BatchStep]:
+        """The state after a step, and what the step did."""
+        size, dtype = self.num_envs, self.dtype
+        states, measured, force, grip, all_rows = self._rows_end
+        c, end = np.empty(old.c.shape, dtype), np.empty((all_rows, size), dtype)
+        now, seen = end, end[grip:]
+        if self.restarts:
+            now, seen = np.empty((measured, size), dtype), np.empty((all_rows - grip, size), dtype)
+        pay, flags = np.empty((len(PAY), size)), np.empty((len(FLAGS), size), bool)
+        counts = np.empty((3, size), np.int64)
+        (env, component), item = actions.strides, actions.itemsize
+        if env % item or component % item:
             actions = actions.copy()
-        apart = (stride // actions.itemsize for stride in actions.strides)
+            env, component = actions.strides
         if actions.flags.f_contiguous:
             actions = actions.T  # the same memory, in the order that `_pointer` needs
         read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
         idle = 0 if waiting is None else _pointer(waiting)
-        written = self.restarts or waiting is not None, self.restarts, *_pointers(*made)
-        memory = _Memory(0, 0, self.num_envs, self.most_steps, 0, *apart, *read, idle, *written)
+        written = _pointers(end, now, seen, c, pay, flags, counts)
+        memory = _Memory(
+            0, 0, size, self.most_steps, 0, env // item, component // item, *read, idle, self.restarts, *written
+        )
         self._run(memory)
-        return tuple(made), bool(memory.bad)
-
-    def _written(self, restarts: bool) -> list[tuple[tuple[int, int], np.dtype]]:
-        """Shapes and kinds of what a step writes, in the order of `_Memory`."""
-        size, kept, kinds = self.num_envs, int(restarts), (self.dtype, np.float64, np.bool_, np.int64, np.float32)
-        real, double, truth, whole, single = map(np.dtype, kinds)
-        return [
-            ((self._reported_rows * (1 + kept), size), real),
-            ((self._seen_rows, size), real),
-            ((5 + 4 * kept, size), double),
-            ((FLAG_ROWS + 3 * kept, size), truth),
-            ((3, size), whole),
-            ((len(self.task.constant_names), size), real),
-            ((size * kept, self._seen_rows), single),
-        ]
+        if memory.bad:  # what was computed is forgotten
+            check_finite(actions)
+        terminated, truncated, success, failure, clipped = flags
+        violated, steps, episode = counts
+        did: Any = {
+            "observation": seen.T,
+            "reward": pay[0],
+            "reward_parts": pay[2:],
+            "cost": pay[1],
+            "terminated": terminated,
+            "truncated": truncated,
+            "final_observation": end[grip:].T,
+            "final_x": end[:states],
+            "success": success,
+            "failure": failure,
+            "violated": violated,
+            "force": end[measured:force],
+            "clipped": clipped,
+            "grip": end[force:grip],
+            "measured": now[states:measured],
+            "final_measured": end[states:measured],
+        }
+        return old._replace(x=now[:states], c=c, steps=steps, episode=episode), BatchStep(**did)
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and their measurements, a row (B,) each."""
-        seen = np.empty((self._seen_rows, self.num_envs), self.dtype)
+        seen = np.empty((self.task.observation_size(self.params), self.num_envs), self.dtype)
         measured = np.empty((len(self.params.MEASUREMENTS), self.num_envs), self.dtype)
         arrays = self._all, state.steps, state.x, state.c, seen, measured
         self._code.ballbot_observe(self.num_envs, self.num_envs, *_pointers(*arrays))
@@ -126,8 +151,8 @@ class _Memory(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "bad", "env", "component")),
         *((name, ctypes.c_void_p) for name in ("x", "c", "action", "steps", "episode", "seed", "idle")),
-        *((name, ctypes.c_int64) for name in ("begins", "restarts")),
-        *((name, ctypes.c_void_p) for name in ("reported", "seen", "pay", "flags", "counts", "new_c", "end_seen")),
+        ("restarts", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("end", "now", "seen", "new_c", "pay", "flags", "counts")),
     )
 
 
@@ -161,18 +186,11 @@ def _check(code: ctypes.CDLL, task: Task, params: Robot, double: bool) -> None:
     )
     for envs in batch:
         envs.state = start = envs.initial_state(seed=0)
-        values = {"first observation": envs.observe(start), "start": start.x, "constants": start.c}
-        *returned, infos = envs.step(actions)
-        ends = {f"final {name}": part for name, part in infos.pop("final_info", {}).items()}
-        outcomes.append(
-            values
-            | dict(zip(("observation", "reward", "terminated", "truncated"), returned, strict=True))
-            | infos
-            | ends
-        )
+        values = {"first observation": envs.observe(start), "start": start.x, "start constants": start.c}
+        outcomes.append(values | envs.step(actions)._asdict() | envs.state._asdict())
     found, expected = outcomes
     for name in expected:
-        if not np.allclose(found.get(name, np.nan), expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
+        if not np.allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NoMachineCodeError(f"{name} of {task.id} gives other results with CasADi's symbols than with numbers")
 
 

@@ -1,4 +1,4 @@
-"""What batches of environments remember, in torch or in NumPy."""
+"""What batches of environments remember, and what a step of them gives: tensors, or NumPy arrays."""
 
 from __future__ import annotations
 
@@ -33,6 +33,52 @@ class BatchState(NamedTuple):
     episode began the first one, with no force."""
     sensors: torch.Tensor
     """(17, B) what sensors remember; (0, B) where the state is observed."""
+
+
+class BatchStep(NamedTuple):
+    """The result of one control step of B environments. Environments whose episode ended have started the next one."""
+
+    observation: torch.Tensor
+    """(B, no) observations. Where an episode ended, the first one of the next episode."""
+    reward: torch.Tensor
+    """(B,) reward of the step: survival_reward · control_dt minus the running cost, plus the reward at a first exit."""
+    reward_parts: torch.Tensor
+    """(3, B) parts of the reward, which add up to it: for living, for the cost, and at the goal."""
+    cost: torch.Tensor
+    """(B,) cost of the step, the price of a failure included."""
+    terminated: torch.Tensor
+    """(B,) bool."""
+    truncated: torch.Tensor
+    """(B,) bool."""
+    final_observation: torch.Tensor
+    """(B, no) observations after the step and before any reset."""
+    final_x: torch.Tensor
+    """(8, B) states after the step and before any reset."""
+    success: torch.Tensor
+    """(B,) bool: the episode ended in the goal."""
+    failure: torch.Tensor
+    """(B,) bool: the episode ended at a violated limit."""
+    violated: torch.Tensor
+    """(B,) int64 index in the batch's `limit_names` of the first limit violated, else −1."""
+    force: torch.Tensor
+    """(2, B) N, what the actuator applied."""
+    clipped: torch.Tensor
+    """(B,) bool: the action was outside [−1, 1]."""
+    grip: torch.Tensor
+    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction that the step needs; (0, B)
+    where friction is unlimited. It carries no gradient."""
+    measured: torch.Tensor
+    """(nm, B) what the robot measures, as its `MEASUREMENTS` name it; where an episode ended, at the start of the next one.
+    It carries no gradient."""
+    final_measured: torch.Tensor
+    """(nm, B) the same after the step and before any reset."""
+
+
+_DONE_BY_STEPS = (
+    *("reward", "reward_parts", "cost", "terminated", "truncated", "success", "failure"),
+    *("force", "clipped", "grip"),
+)
+"""Fields of a `BatchStep` that are 0 of an env that has done nothing in its episode yet."""
 
 
 def _check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:

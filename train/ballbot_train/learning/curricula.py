@@ -181,7 +181,7 @@ class CurriculumBatch(BallbotBatch):
             return result
         assert self.state is not None
         observation = torch.where(ended[:, None], self.observe(self.state), result.observation)
-        return result._replace(observation=observation)
+        return result._replace(observation=observation, measured=self.measurements(self.state))
 
     def _count(self, kind: int, ended: torch.Tensor, success: torch.Tensor) -> bool:
         """Counts the episodes of a kind that ended. True where there are enough to look at; their share is then new."""
