@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym.checks import real_array
-from ballbot_gym.engines import checked_physics, make_simulator
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.tasks import Task
@@ -185,37 +184,3 @@ def sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
         return x
     z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
     return np.array(env.randomization.sensed(tuple(x.tolist()), z, env.get_state().drawn, t))
-
-
-def simulate(
-    controller: Controller,
-    params: Robot,
-    x0: np.ndarray,
-    duration: float,
-    control_dt: float = 0.02,
-    physics: str | None = None,
-) -> Trajectory:
-    """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit.
-
-    `physics` is "bullet", "mujoco" or "rk4"; default, the first that is installed, as for environments.
-
-    Raises:
-        ValueError: a force is no finite number.
-        RuntimeError: the simulation becomes unstable.
-    """
-    simulator = make_simulator(checked_physics(physics), params, control_dt)
-    x = np.asarray(x0, np.float64)
-    simulator.reset(tuple(x.tolist()))
-    controller.reset(0.0, x, np.zeros(0))
-    states, forces = [x], []
-    for k in range(round(duration / control_dt)):
-        u = np.clip(controller.act(k * control_dt, x), -params.force_limit, params.force_limit)
-        if not np.isfinite(u).all():
-            raise ValueError(f"forces must be finite, not {u.tolist()} at {k * control_dt:g} s")
-        x = np.array(simulator.step(tuple(u.tolist())))
-        if simulator.is_unstable() or not np.isfinite(x).all():
-            raise RuntimeError(f"the simulation is unstable from {k * control_dt:g} s on")
-        forces.append(u)
-        states.append(x)
-    simulator.close()
-    return Trajectory(control_dt * np.arange(len(states)), np.array(states), np.array(forces))

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 
 from ballbot_baselines import LqrController, NmpcController, TrajoptController
 from ballbot_gym import files
+from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import Robot, default_params
-from ballbot_gym.rollout import Controller, PlanError, simulate
+from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 
 _SECONDS = 6.0  # until which the robot must be upright again
@@ -63,30 +64,28 @@ def after_push(params: Robot, impulse: float, bearing: float) -> np.ndarray:
     return np.concatenate([np.zeros(4), speed * direction, lean_rate * direction])
 
 
-def survives(task: Stabilize, params: Robot, controller: Controller, impulse: float, bearing: float) -> bool:
-    """Whether the tilt stays within the task's limit, and the robot is upright at the end, in PyBullet."""
+def survives(env: BallbotEnv, controller: Controller, impulse: float, bearing: float) -> bool:
+    """Whether the robot does not fall, and is upright at the end."""
     try:
-        run = simulate(controller, params, after_push(params, impulse, bearing), _SECONDS)
+        run = rollout(env, controller, options={"state": after_push(env.params, impulse, bearing)})
     except PlanError:
         return False
-    return bool(run.tilt.max() < task.max_tilt and run.tilt[-1] < _UPRIGHT)
+    return not run.failure and bool(run.trajectory.tilt[-1] < _UPRIGHT)
 
 
-def hardest(
-    task: Stabilize, params: Robot, controller: Controller, bearing: float, near: float, resolution: float
-) -> float:
+def hardest(env: BallbotEnv, controller: Controller, bearing: float, near: float, resolution: float) -> float:
     """The largest impulse survived, N·s, by bisection from a bracket about `near`, to `resolution`.
 
     At most `_HARDEST`. It takes survival to be monotone, which for NMPC it is not quite: some bearings survive a little more.
     """
     low, high = 0.0, near
-    while survives(task, params, controller, high, bearing):
+    while survives(env, controller, high, bearing):
         if high == _HARDEST:
             return high
         low, high = high, min(1.25 * high, _HARDEST)
     while high - low > resolution:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if survives(task, params, controller, middle, bearing) else (low, middle)
+        low, high = (middle, high) if survives(env, controller, middle, bearing) else (low, middle)
     return low
 
 
@@ -100,11 +99,12 @@ def main(out: Path = Path("runs/push_sweep"), bearings: int = 24, resolution: fl
         quick: three bearings, 10 N·s.
     """
     task, params, pushes = Stabilize(), default_params(), []
+    env = BallbotEnv(Stabilize(duration=_SECONDS, arena_radius=100.0))
     bearings, resolution = (3, 10.0) if quick else (bearings, resolution)
     for name, (_, make) in CONTROLLERS.items():
         controller, near = make(task, params), 64.0
         for bearing in 2 * np.pi * np.arange(bearings) / bearings:
-            near = max(hardest(task, params, controller, bearing, near, resolution), resolution)
+            near = max(hardest(env, controller, bearing, near, resolution), resolution)
             pushes.append(Push(name, float(np.degrees(bearing)), near))
         mine = [push.impulse for push in pushes if push.controller == name]
         print(f"{name:16s} survives {min(mine):.0f} to {max(mine):.0f} N·s, median {np.median(mine):.0f}", flush=True)

@@ -9,7 +9,7 @@ from ballbot_baselines import LqrController, TrajoptController, TvlqrController,
 from ballbot_baselines.solvers.riccati import discrete_lqr
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.rollout import PlanError, rollout, simulate
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.controllers import ControllerName
@@ -67,15 +67,6 @@ def test_settle_time_is_zero_at_rest_and_nan_where_the_goal_is_missed(make_env):
     env = make_env(physics="rk4", duration=0.2)
     assert rollout(env, IDLE, options={"state": UPRIGHT}).settle_time == 0
     assert np.isnan(rollout(env, IDLE, options={"state": [1.0, *[0.0] * 7]}).settle_time)
-
-
-def test_simulation_without_a_task_is_the_simulators(params, physics):
-    push = FunctionController(lambda t, x: np.array([500.0, -20.0]))
-    trajectory = simulate(push, params, UPRIGHT, 0.1, physics=physics)
-    assert trajectory.duration == pytest.approx(0.1)
-    np.testing.assert_array_equal(trajectory.u, np.tile([350.0, -20.0], (5, 1)))
-    exact = params.step(UPRIGHT, np.array([350.0, -20.0]), 0.02)
-    np.testing.assert_allclose(trajectory.x[1], exact, atol=1e-9 if physics == "rk4" else 5e-3)
 
 
 class TrackedOptimum:

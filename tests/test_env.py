@@ -18,7 +18,6 @@ from gymnasium.utils.env_checker import check_env
 from ballbot_gym import BallbotEnv, Randomization
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.robot import default_params, named_robot
-from ballbot_gym.rollout import simulate
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
@@ -381,20 +380,3 @@ def test_an_unstable_simulation_fails_and_says_so(robot, physics, tmp_path, monk
     assert env.reset(seed=0)[1]["violated"] == -1
     env.step([0.0, 0.0])
     env.close()
-    with pytest.raises(RuntimeError, match="unstable from 0 s on"):
-        simulate(_Pushing(), env.params, UPRIGHT, 0.1, physics="mujoco")
-
-
-class _Pushing:
-    def reset(self, t, x, c):
-        pass
-
-    def act(self, t, x):
-        return np.array([1e30, 0.0])
-
-
-def test_simulate_refuses_a_force_that_is_no_number(params):
-    pushing = _Pushing()
-    pushing.act = lambda t, x: np.array([0.0, math.nan])
-    with pytest.raises(ValueError, match="forces must be finite"):
-        simulate(pushing, params, UPRIGHT, 0.1, physics="rk4")

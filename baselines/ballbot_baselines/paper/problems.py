@@ -6,7 +6,7 @@ experiments follow in simulation: its plans under feedback, and LQR compared wit
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,7 +22,7 @@ from ballbot_gym import ops
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.ops import squared
 from ballbot_gym.robot import Ballbot
-from ballbot_gym.rollout import Episode, rollout, simulate
+from ballbot_gym.rollout import Episode, rollout
 from ballbot_gym.tasks.paths import cubic
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
@@ -41,6 +41,7 @@ TRACKING_DT = 0.01
 """Control step at which the paper's plans are tracked, s."""
 LQR_DT = 0.001
 """Control step of the paper's LQR, s. The paper's LQR is continuous."""
+_WIDE_ARENA = 100.0  # m: no plan of the paper leaves it
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,10 @@ class PaperProblem:
         )
         upright = np.zeros(8), np.zeros(2), np.zeros(0)  # uniform motion upright linearizes like standing
         controller = TvlqrController.for_task(task, params, trajectory, end=discrete_lqr(task, params, *upright))
-        executed = simulate(controller, params, trajectory.x[0], round(trajectory.duration / dt) * dt, dt)
+        tracked = replace(task, duration=round(trajectory.duration / dt) * dt, arena_radius=_WIDE_ARENA)
+        env = BallbotEnv(tracked, params=params)
+        executed = rollout(env, controller, options={"state": trajectory.x[0]}).trajectory
+        env.close()
         planned = np.array([trajectory.state(t) for t in executed.t])
         return executed, float(np.hypot(*(executed.x - planned)[:, :2].T).max())
 
