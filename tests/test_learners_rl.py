@@ -225,6 +225,19 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task_and_keeps_the_steady_motion(
             assert learner.network(torch.zeros(8)).tolist() == [0.0, 0.0]
 
 
+def test_sac_weighs_errors_by_costs_and_not_by_the_entropies_that_are_to_come():
+    learner = make("sac")
+    learner._log_ent_coef.data.fill_(np.log(0.01))
+    gamma = learner._model.gamma
+    later = 0.01 * learner.config.target_entropy * gamma / (1 - gamma)
+    without_costs = learner._value_of_living(gamma) + later
+    values = (without_costs - torch.tensor([[0.1], [1.0], [10.0]])).requires_grad_()
+    learner._weigh(None, None, values)
+    values.sum().backward()
+    weights = values.grad.flatten()
+    np.testing.assert_allclose(weights / weights[1], [10, 1, 0.1], rtol=1e-4)
+
+
 @pytest.mark.parametrize("demonstrated", [False, True])
 def test_sac_with_mirrors_learns_from_mirror_images_and_acts_the_same_in_them(demonstrated, demos):
     learner = run(make("sac", demos if demonstrated else None, symmetry="mirrors"))

@@ -198,6 +198,11 @@ class ModelFree(ABC):
         paid = self._reward_scale * self._trained.survival_reward * self._trained.control_dt if self._pay else 0.0
         return paid / (1 - gamma) if gamma < 1 else paid * self._trained.steps
 
+    @property
+    def _value_without_costs(self) -> float:
+        """What the critics learn of a state without any cost from then on."""
+        return self._value_of_living(self._model.gamma)
+
     def _weigh(self, _critics: nn.Module, _inputs: Any, values: Any) -> None:
         """A forward hook of critics: divides gradients that flow back into their values (n, 1), a tensor or several, by the
         cost to go, as the lowest say it. The mean of all n factors is 1.
@@ -206,7 +211,7 @@ class ModelFree(ABC):
         if not several[0].requires_grad:
             return
         lowest = torch.stack([value.detach() for value in several]).amin(0)
-        weights = cost_to_go(lowest, self._value_of_living(self._model.gamma)) ** -1
+        weights = cost_to_go(lowest, self._value_without_costs) ** -1
         weights /= weights.mean()
         for value in several:
             value.register_hook(lambda gradient: gradient * weights)
