@@ -34,10 +34,9 @@ ROLLOUT = """
 enum { B = %d };
 int main(void) {
     static real x[2][STATES * B], c[2][AT_LEAST_1(CONSTANTS) * B], action[ACTIONS * B];
-    static real reported[2 * REPORTED * B], seen[SEEN * B];
-    static double pay[9 * B];
-    static uint8_t flags[9 * B];
-    static float end_seen[SEEN * B];
+    static real end[ROWS * B], now[FORCE * B], seen[SEEN * B];
+    static double pay[PAYS * B];
+    static uint8_t flags[FLAGS * B];
     static int64_t which[B], seed[B], episode[2][B], counts[3 * B], steps[B];
     for (int k = 0; k < B; ++k)
         which[k] = seed[k] = k;
@@ -46,10 +45,10 @@ int main(void) {
         for (int i = 0; i < ACTIONS * B; ++i)
             action[i] = (real)0.5 * real_sin((real)(n + 0.1 * i));
         Memory m = {.B = B, .most = 10, .env = 1, .component = B, .x = x[0], .c = c[0], .action = action, .steps = steps,
-                    .episode = episode[0], .seed = seed, .begins = 1, .restarts = 1, .reported = reported,
-                    .seen = seen, .pay = pay, .flags = flags, .counts = counts, .new_c = c[1], .end_seen = end_seen};
+                    .episode = episode[0], .seed = seed, .restarts = 1, .end = end, .now = now, .seen = seen,
+                    .new_c = c[1], .pay = pay, .flags = flags, .counts = counts};
         step(&m);
-        memcpy(x[0], reported, sizeof x[0]);
+        memcpy(x[0], now, sizeof x[0]);
         memcpy(c[0], c[1], sizeof c[0]);
         memcpy(steps, counts + B, sizeof steps);
         memcpy(episode[0], counts + 2 * B, sizeof steps);
