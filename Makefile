@@ -158,7 +158,7 @@ INSTALL := $(BIN)/pip install --no-compile -c constraints.txt
 $(VENV)/python: pyproject.toml constraints.txt
 	@if command -v $(PYTHON) >/dev/null; then \
 		{ $(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(VENV) install --no-compile "pip>=25"; } || \
-			$(PYTHON) -m venv $(VENV); \
+		{ $(PYTHON) -m venv $(VENV) && $(BIN)/python -m pip install --no-compile "pip>=25"; }; \
 	elif command -v uv >/dev/null; then \
 		uv venv --allow-existing --seed --python 3.11 $(VENV); \
 	else \
@@ -166,7 +166,6 @@ $(VENV)/python: pyproject.toml constraints.txt
 		echo "Install Python 3.11 or uv, or name your interpreter: make PYTHON=/path/to/python3.11"; \
 		exit 1; \
 	fi
-	$(BIN)/python -m pip install --no-compile "pip>=25"
 	touch $@
 
 # what the commands need
