@@ -49,27 +49,17 @@ def _gymnasium_reset(batch: BallbotBatch | BallbotArrays, mask: np.ndarray) -> t
     state: Any = batch.state
     size, rows = batch.num_envs, (batch.params.action_size, 4 * batch.params.grips)
     force, grip = (np.zeros((count, size), _as_array(state.x).dtype) for count in rows)
-    cost, parts, none = np.zeros(size), np.zeros((3, size)), np.zeros(size, bool)
     seen, measured = _as_array(batch.observe(state)), _as_array(batch.measurements(state))
-    did: Any = (
-        seen,
-        cost,
-        parts,
-        cost,
-        none,
-        none,
-        seen,
-        state.x,
-        none,
-        none,
-        cost,
-        force,
-        none,
-        grip,
-        measured,
-        measured,
-    )
-    return seen.astype(np.float32, copy=False), _masked(_info(batch, state, measured, BatchStep(*did)), mask)
+    nothing: Any = {
+        **dict.fromkeys(("reward", "cost", "violated"), np.zeros(size)),
+        **dict.fromkeys(("terminated", "truncated", "success", "failure", "clipped"), np.zeros(size, bool)),
+        "reward_parts": np.zeros((3, size)),
+        "force": force,
+        "grip": grip,
+    }
+    shown: Any = {"observation": seen, "final_observation": seen, "measured": measured, "final_measured": measured}
+    did = BatchStep(**nothing, **shown, final_x=state.x)
+    return seen.astype(np.float32, copy=False), _masked(_info(batch, state, measured, did), mask)
 
 
 def _masked(info: Info, mask: np.ndarray) -> dict[str, Any]:
