@@ -15,7 +15,7 @@ from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.robot import Randomization, Robot
 from ballbot_gym.step import FLAGS, PAY, StepState, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
-from ballbot_gym.vector.state import _DONE_BY_STEPS, BatchState, BatchStep, _check_starts
+from ballbot_gym.vector.state import BatchState, BatchStep, _check_starts
 
 State = Any
 """A `BatchState` whose fields are NumPy arrays."""
@@ -45,7 +45,6 @@ class BallbotArrays:
         self.observation = "state"
         self.most_steps, self.restarts = task.steps, True
         self._state: State = None
-        self._all = np.arange(self.num_envs)
         size, nothing = self.num_envs, np.zeros((0, self.num_envs), dtype)
         x, c = (np.zeros((rows, size), dtype) for rows in (params.state_size, len(task.constant_names)))
         seeds = np.array(seeding.seeds_of(int(np.random.SeedSequence().generate_state(1)[0]), size))
@@ -161,7 +160,7 @@ class BallbotArrays:
             flags, (did.terminated, did.truncated, did.success, did.failure, made.clipped), strict=True
         ):
             row[:] = np.asarray(part) != 0
-        terminated, truncated, success, failure, clipped = flags
+        terminated, truncated, *_ = flags
         truncated |= ~terminated & (old.steps + 1 >= self.most_steps)
         new = old._replace(x=end, steps=old.steps + 1)
         last, last_measured = self._seen(new)
@@ -178,26 +177,32 @@ class BallbotArrays:
         pay = np.empty((len(PAY), size))
         for row, name in zip(pay, PAY, strict=True):
             row[:] = getattr(did, name)
-        result: Any = {
-            "observation": seen.T,
-            "reward": pay[0],
-            "reward_parts": pay[2:],
-            "cost": pay[1],
-            "terminated": terminated,
-            "truncated": truncated,
-            "final_observation": last.T,
-            "final_x": end,
-            "success": success,
-            "failure": failure,
-            "violated": np.array(did.violated, np.int64),
-            "force": self._rows(made.force, size),
-            "clipped": clipped,
-            "grip": self._rows(made.grip, size),
-            "measured": measured,
-            "final_measured": last_measured,
-        }
+        force, grip, violated = (
+            self._rows(made.force, size),
+            self._rows(made.grip, size),
+            np.array(did.violated, np.int64),
+        )
         if waiting is not None:
-            for name in _DONE_BY_STEPS:
-                result[name][..., waiting] = 0
-            result["violated"][waiting] = -1
-        return new, BatchStep(**result)
+            for part in (pay, flags, force, grip):
+                part[:, waiting] = 0
+            violated[waiting] = -1
+        return new, _batch_step(
+            pay,
+            flags,
+            observation=seen.T,
+            final_observation=last.T,
+            final_x=end,
+            violated=violated,
+            force=force,
+            grip=grip,
+            measured=measured,
+            final_measured=last_measured,
+        )
+
+
+def _batch_step(pay: np.ndarray, flags: np.ndarray, **parts: Any) -> BatchStep:
+    """A step from rows of pay and flags, those of `step.PAY` and `step.FLAGS`, and from its other fields."""
+    terminated, truncated, success, failure, clipped = flags
+    ends: Any = {"terminated": terminated, "truncated": truncated, "success": success, "failure": failure}
+    paid: Any = {"reward": pay[0], "cost": pay[1], "reward_parts": pay[2:]}
+    return BatchStep(**paid, **ends, clipped=clipped, **parts)

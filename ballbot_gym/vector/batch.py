@@ -29,7 +29,7 @@ from ballbot_gym.robot import (
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.step import FLAGS, Draws, StepState, check_observation, limit_names, observe, start, start_draws, step
 from ballbot_gym.tasks import Task
-from ballbot_gym.vector.state import _DONE_BY_STEPS, BatchState, BatchStep, _check_starts
+from ballbot_gym.vector.state import BatchState, BatchStep, _check_starts
 
 with imports_of("a batch of environments", "train"):
     import torch
@@ -52,6 +52,12 @@ COMPILE_OPTIONS: dict[str, Any] = {
 _FIXED = ("task", "params", "randomization", "history", "observation", "num_envs", "device", "dtype", "limit_names")
 """Attributes of a batch that cannot be set once it is made: more is computed from them."""
 
+
+_DONE_BY_STEPS = (
+    *("reward", "reward_parts", "cost", "terminated", "truncated", "success", "failure"),
+    *("force", "clipped", "grip"),
+)
+"""Fields of a `BatchStep` that are 0 of an env that has done nothing in its episode yet."""
 
 _Rows = Any
 """A `BatchState` in which each matrix is a tuple of its rows (B,). Everything is computed in this form."""
@@ -423,7 +429,7 @@ class BallbotBatch:
         return BatchState(*(self._stack(part, rows.seed) if isinstance(part, tuple) else part for part in rows))
 
     def _stack(self, parts: tuple[torch.Tensor, ...], like: torch.Tensor) -> torch.Tensor:
-        """(n, B) tensor of n components, of which each has the shape of `like`."""
+        """(n, B) tensor of n components, each in the shape of `like`."""
         return torch.stack(parts) if parts else torch.zeros(0, *like.shape, dtype=self.dtype, device=like.device)
 
 

@@ -23,7 +23,7 @@ from ballbot_gym.robot import Robot
 from ballbot_gym.step import FLAGS, PAY
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.identity import problem_digest
-from ballbot_gym.vector.arrays import BallbotArrays, State
+from ballbot_gym.vector.arrays import BallbotArrays, State, _batch_step
 from ballbot_gym.vector.state import BatchStep
 
 # With GCC, -O3 takes half as much time again, and steps of large batches of robots without wheels take 6 to 8 % longer.
@@ -85,10 +85,11 @@ class BallbotNative(BallbotArrays):
         """The state after a step, and what the step did."""
         size, dtype = self.num_envs, self.dtype
         states, measured, force, grip, all_rows = self._rows_end
+        if self.restarts:  # observations come first, so that they take the memory of earlier ones
+            seen, now = np.empty((all_rows - grip, size), dtype), np.empty((measured, size), dtype)
         c, end = np.empty(old.c.shape, dtype), np.empty((all_rows, size), dtype)
-        now, seen = end, end[grip:]
-        if self.restarts:
-            now, seen = np.empty((measured, size), dtype), np.empty((all_rows - grip, size), dtype)
+        if not self.restarts:
+            seen, now = end[grip:], end
         pay, flags = np.empty((len(PAY), size)), np.empty((len(FLAGS), size), bool)
         counts = np.empty((3, size), np.int64)
         (env, component), item = actions.strides, actions.itemsize
@@ -106,27 +107,20 @@ class BallbotNative(BallbotArrays):
         self._run(memory)
         if memory.bad:  # what was computed is forgotten
             check_finite(actions)
-        terminated, truncated, success, failure, clipped = flags
         violated, steps, episode = counts
-        did: Any = {
-            "observation": seen.T,
-            "reward": pay[0],
-            "reward_parts": pay[2:],
-            "cost": pay[1],
-            "terminated": terminated,
-            "truncated": truncated,
-            "final_observation": end[grip:].T,
-            "final_x": end[:states],
-            "success": success,
-            "failure": failure,
-            "violated": violated,
-            "force": end[measured:force],
-            "clipped": clipped,
-            "grip": end[force:grip],
-            "measured": now[states:measured],
-            "final_measured": end[states:measured],
-        }
-        return old._replace(x=now[:states], c=c, steps=steps, episode=episode), BatchStep(**did)
+        did = _batch_step(
+            pay,
+            flags,
+            observation=seen.T,
+            final_observation=end[grip:].T,
+            final_x=end[:states],
+            violated=violated,
+            force=end[measured:force],
+            grip=end[force:grip],
+            measured=now[states:measured],
+            final_measured=end[states:measured],
+        )
+        return old._replace(x=now[:states], c=c, steps=steps, episode=episode), did
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and their measurements, a row (B,) each."""

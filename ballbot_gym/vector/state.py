@@ -74,13 +74,6 @@ class BatchStep(NamedTuple):
     """(nm, B) the same after the step and before any reset."""
 
 
-_DONE_BY_STEPS = (
-    *("reward", "reward_parts", "cost", "terminated", "truncated", "success", "failure"),
-    *("force", "clipped", "grip"),
-)
-"""Fields of a `BatchStep` that are 0 of an env that has done nothing in its episode yet."""
-
-
 def _check_starts(task: Task, x: tuple, c: tuple, mask: Any) -> None:
     """Raises a ValueError if states in 8 rows (B,) violate a limit of the task where the mask holds."""
     violated = first_violated(task.limits(x, task.at(c, 0 * x[0])), like=x)

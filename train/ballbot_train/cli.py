@@ -174,8 +174,8 @@ def _registered_word(flag: str, word: str) -> str:
     with hyphens, and "pybullet".
     """
     from ballbot_gym.engines import PHYSICS_ALIASES
+    from ballbot_gym.registry import named_task
     from ballbot_gym.robot import short_name
-    from ballbot_gym.tasks import TASKS
 
     if _MODULE_AND_NAME.fullmatch(word):
         if os.getcwd() not in sys.path:
@@ -185,9 +185,10 @@ def _registered_word(flag: str, word: str) -> str:
         return _registered_file(Path(word))
     if flag == "--physics":
         return PHYSICS_ALIASES.get(word, word)
-    tasks = {alias: name for name, kind in TASKS.items() for alias in (kind.id, kind.counterpart)}
-    underscored = word.replace("-", "_")
-    return tasks.get(word, underscored if underscored in TASKS else word)
+    try:
+        return named_task(word)
+    except ValueError:  # it names something else
+        return word
 
 
 def _registered_file(path: Path) -> str:

@@ -243,6 +243,11 @@ def _filtered(controller: Controller, filter: str | None, task: Task, params: Ro
     return FilteredController(task, params, f"-{filter}", controller)
 
 
+def _senses(controller: Controller) -> bool:
+    """Whether a controller takes the readings of sensors, and not states."""
+    return getattr(controller, "senses", False)
+
+
 def as_controller(policy: Any, task: Task, params: Robot, filter: str | None = None) -> Controller:
     """Any policy or controller as a Controller.
 

@@ -32,7 +32,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_gym.vector.batch import BallbotBatch, BatchState
 from ballbot_gym.vector.episodes import BatchEpisodes, run_episodes
-from ballbot_train.evaluation.controllers import ControllerName, as_controller
+from ballbot_train.evaluation.controllers import ControllerName, _senses, as_controller
 from ballbot_train.evaluation.results import near_share, to_json, warn_of_small
 from ballbot_train.evaluation.statistics import Interval
 from ballbot_train.policy.layers import with_compiled_layers
@@ -332,7 +332,7 @@ def _acting(policy: Any, task: Task, robot: str) -> Any:
     if isinstance(policy, str | Path):
         name = ControllerName(str(policy))
         controller = None if name.is_expert else name.make(task, params)
-        if controller is None or getattr(controller, "senses", False):
+        if controller is None or _senses(controller):
             what = "an expert" if controller is None else "behind the filter of sensors"
             raise ValueError(
                 f"{policy} is {what}, which acts in one episode at a time, and fresh episodes run all at once; give a "

@@ -24,7 +24,7 @@ from ballbot_gym.robot import PAPER, Randomization, Robot, named_robot, robot_se
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.controllers import ControllerName, as_controller, policy_digests
+from ballbot_train.evaluation.controllers import ControllerName, _senses, as_controller, policy_digests
 from ballbot_train.evaluation.recordings import Recording
 from ballbot_train.evaluation.results import Result, Row, table_cells, write_results
 from ballbot_train.policy.files import PolicyFile, shipped_ways
@@ -262,11 +262,6 @@ def _episode_entries(
     for i, result in enumerate(results):
         moved = {} if motions is None else {"motion": base64.b64encode(motions[i].to_bytes()).decode()}
         yield asdict(result) | moved
-
-
-def _senses(controller: Controller) -> bool:
-    """Whether a controller takes the readings of sensors, and not states."""
-    return getattr(controller, "senses", False)
 
 
 def _showing(env: BallbotEnv, controller: Controller) -> BallbotEnv:

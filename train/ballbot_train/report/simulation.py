@@ -19,9 +19,9 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robot import PAPER, ROBOTS, Randomization, default_params, named_robot, tilt
 from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation.controllers import ControllerName
+from ballbot_train.evaluation.controllers import ControllerName, _senses
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.evaluation.runner import _senses, _showing
+from ballbot_train.evaluation.runner import _showing
 from ballbot_train.policy.files import BEST
 from ballbot_train.report import labels
 from ballbot_train.work.console import check_names
