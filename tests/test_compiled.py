@@ -13,8 +13,9 @@ pytest.importorskip("casadi")
 import casadi
 import numpy as np
 
-from ballbot_baselines.solvers import compiled
+from ballbot_baselines.solvers import compiled, nlp
 from ballbot_gym.machine_code import codegen, libraries
+from ballbot_gym.robot import named_robot
 
 needs_compiler = pytest.mark.skipif(libraries.compiler() is None, reason="no C compiler")
 posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
@@ -69,6 +70,38 @@ def test_lanes_give_the_values_of_every_stage(folder, caplog):
             # vector versions of sine and cosine are wrong by up to 4 units in the last place
             np.testing.assert_allclose(np.array(found)[:, k], np.array(expected).ravel(), rtol=1e-15, atol=2e-15)
         assert float(fast_product(x)[k]) == pytest.approx(float(product(x[:, k])), rel=1e-15)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["paper", "rolling", "omni"])
+def test_steps_of_rk4_have_the_derivatives_of_a_robot_s_step(folder, name):
+    robot, steps = named_robot(name), 3
+    kind, states = robot.kind, robot.state_size
+    z, p = casadi.SX.sym("z", states + robot.action_size), casadi.SX.sym("p", 1 + len(kind.numbers))
+    model, multipliers = kind.model(p[1:]), casadi.SX.sym("l", states)
+    x, u = z[:states], z[states:]
+    after, rates = casadi.SX(model.step(x, u, p[0], steps)), p[0] * model.derivative(x, u)
+    made = nlp.dynamics(z, p, rates, steps)
+    hessian, gradient = casadi.hessian(casadi.dot(multipliers, after), z)
+    expected = casadi.Function("expected", [z, p, multipliers], [after, casadi.jacobian(after, z), gradient, hessian])
+    rng = np.random.default_rng(0)
+    lanes = (
+        rng.uniform(-0.5, 0.5, size=(z.shape[0], compiled.LANES)),
+        np.tile(np.array([0.03, *robot.numbers()])[:, None], compiled.LANES),
+        rng.normal(size=(states, compiled.LANES)),
+    )
+    values = lanes[0], lanes[1][: made.params]
+    found = made.value(*values), *made.jacobian(*values), *made.hessian(*values, lanes[2])
+    for k in range(compiled.LANES):
+        after, jacobian, gradient, hessian = expected(*(part[:, k] for part in lanes))
+        patterns = made.jacobian_at, made.hessian_at
+        entries = [
+            np.array(casadi.project(part, at).nonzeros())
+            for part, at in zip((jacobian, hessian), patterns, strict=True)
+        ]
+        for got, wanted in zip(found, (after, after, entries[0], gradient, entries[1]), strict=True):
+            wanted = np.array(wanted).ravel()
+            np.testing.assert_allclose(np.array(got)[:, k], wanted, rtol=1e-10, atol=1e-10 * np.abs(wanted).max())
 
 
 @needs_compiler

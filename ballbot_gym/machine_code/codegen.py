@@ -148,7 +148,8 @@ def single_source(arguments: Mapping[str, int], functions: Mapping[str, Function
     return "\n".join(["#define DOUBLE 1\n#define LANES 1", text("real.h"), *blocks])
 
 
-_TRANSPOSE = """
+_CASADI = """
+typedef long long casadi_int;
 static void gather(int rows, const double *columns, real *out) {
     for (int k = 0; k < LANES; ++k)
         for (int i = 0; i < rows; ++i)
@@ -163,6 +164,12 @@ static void scatter(int rows, const real *in, double *columns) {
 """CasADi's matrices have a column per stage, and blocks a row per variable. A null pointer is a 0, or not wanted."""
 
 
+def header(**sizes: int) -> str:
+    """Where C code begins that CasADi loads: numbers by name, one of them LANES, and what `external` calls."""
+    defined = (f"#define {name} {size}" for name, size in {"DOUBLE": 1, **sizes}.items())
+    return "\n".join([*defined, text("real.h"), _CASADI])
+
+
 def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
     """The C code of functions that CasADi loads as external ones: each computes `lanes` stages, a column each, at once.
 
@@ -173,31 +180,44 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
     Raises:
         NotImplementedError: a function has an operation that is not known here.
     """
-    parts = [f"#define DOUBLE 1\n#define LANES {lanes}", text("real.h"), "typedef long long casadi_int;", _TRANSPOSE]
+    parts = [header(LANES=lanes)]
     for function in functions:
         name = function.name()
         symbols = [casadi.SX.sym(f"in{i}", function.size1_in(i)) for i in range(function.n_in())]
         inputs = [(f"in{i}", casadi.vertsplit(part)) for i, part in enumerate(symbols)]
         outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
         parts.append(block(f"{name}_lanes", inputs, outputs))
-        body = []
-        for i, (pointer, rows) in enumerate(inputs):
-            body.append(f"real {pointer}[{max(len(rows), 1)} * LANES]; gather({len(rows)}, arg[{i}], {pointer});")
-        body += [f"real {pointer}[{max(len(rows), 1)} * LANES];" for pointer, rows in outputs]
-        body.append(f"{name}_lanes({', '.join(f'{pointer}, LANES' for pointer, _ in (*inputs, *outputs))});")
-        body += [f"scatter({len(rows)}, {pointer}, res[{i}]);" for i, (pointer, rows) in enumerate(outputs)]
-        for direction, columns in (("in", inputs), ("out", outputs)):
-            parts.append(f"casadi_int {name}_n_{direction}(void) {{ return {len(columns)}; }}")
-            sizes = ", ".join(f"{{{len(rows)}, LANES, 1}}" for _, rows in columns)  # 1 says that a matrix is dense
-            parts.append(
-                f"const casadi_int *{name}_sparsity_{direction}(casadi_int i) {{\n"
-                f"    static const casadi_int sizes[][3] = {{{sizes}}};\n    return sizes[i];\n}}"
-            )
-        lines = "\n    ".join(body)
+        sizes = ({pointer: len(rows) for pointer, rows in columns} for columns in (inputs, outputs))
+        parts.append(external(name, *sizes, stride=", LANES"))
+    return "\n".join(parts)
+
+
+def external(name: str, inputs: Mapping[str, int], outputs: Mapping[str, int], stride: str = "") -> str:
+    """What CasADi looks for in a library to call `NAME_lanes`: the function, and the sizes of what it reads and writes.
+
+    Args:
+        name: the function's name.
+        inputs: rows of each pointer that it reads, by name.
+        outputs: rows of each that it writes.
+        stride: what follows a pointer in the call.
+    """
+    body = [f"real {pointer}[{max(rows, 1)} * LANES];" for pointer, rows in (*inputs.items(), *outputs.items())]
+    body += [f"gather({rows}, arg[{i}], {pointer});" for i, (pointer, rows) in enumerate(inputs.items())]
+    body.append(f"{name}_lanes({', '.join(f'{pointer}{stride}' for pointer in (*inputs, *outputs))});")
+    body += [f"scatter({rows}, {pointer}, res[{i}]);" for i, (pointer, rows) in enumerate(outputs.items())]
+    parts = []
+    for direction, columns in (("in", inputs), ("out", outputs)):
+        parts.append(f"casadi_int {name}_n_{direction}(void) {{ return {len(columns)}; }}")
+        sizes = ", ".join(f"{{{rows}, LANES, 1}}" for rows in columns.values())  # 1 says that a matrix is dense
         parts.append(
-            f"int {name}(const double **arg, double **res, casadi_int *iw, double *w, int mem) {{\n    {lines}\n"
-            "    return 0;\n}"
+            f"const casadi_int *{name}_sparsity_{direction}(casadi_int i) {{\n"
+            f"    static const casadi_int sizes[][3] = {{{sizes}}};\n    return sizes[i];\n}}"
         )
+    lines = "\n    ".join(body)
+    parts.append(
+        f"int {name}(const double **arg, double **res, casadi_int *iw, double *w, int mem) {{\n    {lines}\n"
+        "    return 0;\n}"
+    )
     return "\n".join(parts)
 
 

@@ -11,7 +11,8 @@ import casadi
 import numpy as np
 
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
-from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
+from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
+from ballbot_baselines.solvers.nlp import dynamics
 from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.tasks import Task
 
@@ -227,11 +228,8 @@ def _stage_function(task: Task, kind: Kind) -> casadi.Function:
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
     robot: Any = kind.model(p[1:])
     z, u, h = casadi.vertcat(x, a), robot.force_limit * a, p[0]
-    after = robot.step(x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))
     outputs = [
-        after,
-        casadi.vec(casadi.densify(casadi.jacobian(after, z))),
         casadi.densify(casadi.gradient(task.cost(x, u, c) * h, z)),
         margins,
         casadi.vec(casadi.densify(casadi.jacobian(margins, x))),
@@ -246,8 +244,19 @@ def _stage_function(task: Task, kind: Kind) -> casadi.Function:
         # only the end of a control step that is nearer to slipping: each row costs time
         grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
         outputs += [grip, casadi.vec(casadi.densify(casadi.jacobian(grip, z)))]
-    function = casadi.Function("stage", inputs, outputs, {"cse": True})
-    return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if kind.robot.LONG_EQUATIONS else SIMD)[0]
+    (others,) = in_lanes(f"{task.id}-nmpc", (casadi.Function("stage", inputs, outputs, {"cse": True}),))
+    # two steps of RK4, as the env takes per control step
+    discrete = kind.robot.DISCRETE
+    motion = dynamics(
+        z, p, casadi.SX(robot.step(x, u, h) if discrete else h * robot.derivative(x, u)), 0 if discrete else 2
+    )
+    given = [casadi.MX.sym(name, others.size_in(i)) for i, name in enumerate(others.name_in())]
+    after, entries = motion.jacobian(casadi.vertcat(*given[:2]), given[2][: motion.params, :])
+    # each entry of the Jacobian is one of the nonzeros, or the 0 before them
+    count = motion.jacobian_at.nnz()
+    numbers = casadi.vec(casadi.densify(casadi.DM(motion.jacobian_at, list(range(1, count + 1)))))
+    jacobian = casadi.vertcat(casadi.MX.zeros(1, LANES), entries)[[int(i) for i in numbers.nonzeros()], :]
+    return casadi.Function("stage", given, [after, jacobian, *others.call(given)])
 
 
 def _solver(

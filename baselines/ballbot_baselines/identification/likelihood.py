@@ -23,7 +23,7 @@ import casadi
 import numpy as np
 import scipy.interpolate
 
-from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, InPlace, in_lanes
+from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
 from ballbot_gym.robot import Ballbot, Kind
 from ballbot_gym.tasks.paths import hermite_basis
 
@@ -43,7 +43,6 @@ _POSES = {0, 1, 2, 3, 8}  # components of a state without noise of their own: th
 _START = np.array([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.5, 0.5, 0.1, 0.5, 0.5])
 """Standard deviation of each component of a state that is not read, before the first reading, SI units."""
 _MOST_LEAD = 0.3  # of a step
-_MANY = 8000  # operations of a function on which the compiler would spend minutes with all optimizations
 
 
 @dataclass(frozen=True)
@@ -375,8 +374,7 @@ def _step(
     function = casadi.Function(
         "filter", [held, constants, step], [casadi.densify(each) for each in outputs], {"cse": True}
     )
-    flags = LONG if function.n_instructions() > _MANY else SIMD
-    return in_lanes("identify", (function,), flags)[0], size
+    return in_lanes("identify", (function,))[0], size
 
 
 def _ago(rates: Callable[[Any, Any], tuple[Any, ...]], x: Any, u: tuple[Any, ...], ago: float) -> Any:

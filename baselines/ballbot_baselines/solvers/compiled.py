@@ -5,7 +5,7 @@ results to rounding.
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import casadi
 import numpy as np
@@ -26,7 +26,9 @@ SIMD = (
 """Flags of the compiler for functions of `LANES` stages."""
 
 LONG = (*SIMD, "-O1", "-fno-ivopts")
-"""The same for tens of thousands of operations, on which the compiler would spend twice the time."""
+"""The same for more than `_MANY` operations, on which the compiler would spend twice the time."""
+
+_MANY = 8000
 
 _log = logging.getLogger(__name__)
 
@@ -44,15 +46,13 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
     generator = casadi.CodeGenerator("stage.c")
     for function in functions:
         generator.add(function)
-    return _loaded(name, generator.dump, functions, ("-O2",)) or functions
+    return loaded(name, generator.dump, _names(functions), ("-O2",)) or functions
 
 
-def in_lanes(
-    name: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...] = SIMD
-) -> tuple[casadi.Function, ...]:
+def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.Function, ...]:
     """The same functions of `LANES` stages at once, which SIMD instructions compute: a column for each stage.
 
-    Args: those of `compiled`. Arguments and results are dense columns. `flags` are the compiler's.
+    Args: those of `compiled`. Arguments and results are dense columns.
 
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
@@ -64,8 +64,9 @@ def in_lanes(
         problem = LANES, *(function.serialize() for function in functions)
         return machine_code.printed(lanes, problem, (), lambda: codegen.in_lanes(functions, LANES))
 
+    flags = LONG if sum(function.n_instructions() for function in functions) > _MANY else SIMD
     try:
-        found = _loaded(lanes, source, functions, flags)
+        found = loaded(lanes, source, _names(functions), flags)
     except NotImplementedError:  # an operation that only CasADi can write as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)
@@ -97,15 +98,19 @@ class InPlace:
         return bool(self._buffer.stats()["success"])
 
 
-def _loaded(
-    name: str, source: Callable[[], str], functions: tuple[casadi.Function, ...], flags: tuple[str, ...]
+def loaded(
+    name: str, source: Callable[[], str], functions: Iterable[str], flags: tuple[str, ...]
 ) -> tuple[casadi.Function, ...] | None:
-    """The functions of a library of the C code that `source` prints; None where there is none."""
+    """The functions, by their names, of a library of the C code that `source` prints; None where there is none."""
     code = source()
     try:
         library = machine_code.library(name, code, flags)
-        return tuple(casadi.external(function.name(), str(library)) for function in functions)
+        return tuple(casadi.external(function, str(library)) for function in functions)
     except RuntimeError as error:  # it cannot be compiled, or not be loaded
         if str(error):
             _log.warning("derivatives of %s stay interpreted: %s", name, str(error)[-300:])
     return None
+
+
+def _names(functions: Iterable[casadi.Function]) -> list[str]:
+    return [function.name() for function in functions]

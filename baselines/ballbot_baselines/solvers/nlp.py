@@ -24,11 +24,13 @@ Constraints g, in the order that fatrop needs:
 """
 
 import itertools
+from typing import Any
 
 import casadi
 import numpy as np
 
-from ballbot_baselines.solvers.compiled import LANES, LONG, SIMD, compiled, in_lanes
+from ballbot_baselines.solvers import rk4
+from ballbot_baselines.solvers.compiled import LANES, in_lanes
 
 
 class _Stage:
@@ -46,12 +48,11 @@ class _Stage:
     | `size`, `width`, `params` | lengths of out, of z, and of the p that is taken |
     """
 
-    def __init__(
-        self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, of_stages: bool, flags: tuple[str, ...] = SIMD
-    ):
+    def __init__(self, name: str, z: Any, p: Any, out: Any, of_stages: bool):
+        """Args: z, p, out: symbols and an expression, of CasADi's SX, or MX where stages are not compiled."""
         used = max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0)
-        p = p[:used] if used else casadi.SX.sym("p", 0)
-        multipliers = casadi.SX.sym("l", out.shape[0])
+        p = p[:used] if used else type(p).sym("p", 0)
+        multipliers = type(out).sym("l", out.shape[0])
         jacobian = casadi.jacobian(out, z)
         hessian, gradient = casadi.hessian(casadi.dot(multipliers, out), z)
         options = {"cse": True}
@@ -60,79 +61,38 @@ class _Stage:
             casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
             casadi.Function("hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options),
         )
-        self.value, self.jacobian, self.hessian = in_lanes(name, functions, flags=flags) if of_stages else functions
+        self.value, self.jacobian, self.hessian = in_lanes(name, functions) if of_stages else functions
         self.size, self.width, self.params = out.shape[0], z.shape[0], p.shape[0]
         self.jacobian_at, self.hessian_at = jacobian.sparsity(), hessian.sparsity()
-
-
-_AHEAD, _SHARE = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-"""Of RK4's four evaluations: how far ahead in a step, and the share of their rates in it."""
-
-
-class _RatesStage(_Stage):
-    """A stage whose result is the state after RK4 steps of given rates. It is for rates with many operations: the steps and
-    their derivatives, written out, would take minutes to compile.
-
-    The chain rule is applied to the derivatives of the rates, which are functions of their own.
-    """
-
-    def __init__(self, z: casadi.SX, p: casadi.SX, rates: casadi.SX, steps: int):
-        n, width = rates.shape[0], z.shape[0]
-        used = max(np.flatnonzero(casadi.which_depends(rates, p, 1)) + 1, default=0)
-        p, weights = p[:used], casadi.SX.sym("l", n)
-        slopes, curve = casadi.jacobian(rates, z), casadi.hessian(casadi.dot(weights, rates), z)[0]
-        first = casadi.Function("rates_jacobian", [z, p], [rates, casadi.densify(slopes)], {"cse": True})
-        second = casadi.Function("rates_hessian", [z, p, weights], [casadi.densify(curve)], {"cse": True})
-
-        z_all, p_all, l_all = (casadi.MX.sym("zpl"[i], part.shape[0]) for i, part in enumerate((z, p, weights)))
-        x, w, h = z_all[:n], z_all[n:], 1 / steps
-        inputs = casadi.DM.eye(width)[n:, :]
-        moved = casadi.MX(casadi.densify(casadi.DM.eye(width)[:n, :]))  # ∂x/∂z
-        stages = []  # where rates are evaluated, ∂ of that place/∂z, and ∂rates/∂place
-        for _ in range(steps):
-            rate, change, end, ends = casadi.MX(n, 1), casadi.MX(n, width), x, moved
-            for ahead, share in zip(_AHEAD, _SHARE, strict=True):
-                at = casadi.vertcat(x + h * ahead * rate, w)
-                moves = casadi.densify(casadi.vertcat(moved + h * ahead * change, inputs))
-                rate, slope = first(at, p_all)
-                change = slope @ moves
-                stages.append((at, moves, slope))
-                end, ends = end + h * share * rate, ends + h * share * change
-            x, moved = end, ends
-        price, total = l_all, casadi.MX.zeros(width, width)
-        for step in reversed(range(steps)):
-            before, behind = price, casadi.MX(n, 1)
-            for i in reversed(range(4)):
-                at, moves, slope = stages[4 * step + i]
-                of_rate = h * _SHARE[i] * price + behind
-                total += moves.T @ (second(at, p_all, of_rate) @ moves)
-                back = (of_rate.T @ slope)[:, :n].T
-                before, behind = before + back, h * _AHEAD[i] * back
-            price = before
-        functions = (
-            casadi.Function("value", [z_all, p_all], [x]),
-            casadi.Function("jacobian", [z_all, p_all], [x, casadi.vec(moved)]),
-            casadi.Function("hessian", [z_all, p_all, l_all], [(l_all.T @ moved).T, casadi.vec(total)]),
-        )
-        self.value, self.jacobian, self.hessian = (function.map(LANES) for function in compiled("dynamics", functions))
-        self.size, self.width, self.params = n, width, used
-        self.jacobian_at, self.hessian_at = (casadi.Sparsity.dense(rows, width) for rows in (n, width))
 
 
 _dynamics_made: dict[tuple[str, int], _Stage] = {}
 
 
-def _dynamics(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
+def dynamics(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
     """The stage of dynamics, shared by problems of the same equations, as those of all tasks of a robot are.
 
-    To differentiate and to print them takes half a second.
+    Args:
+        z: states and inputs.
+        p: parameters.
+        move: the next states; or rates of the states, which RK4 steps integrate over a time of 1.
+        steps: the number of these steps, or 0.
     """
+    move = casadi.densify(move)
     used = int(max(np.flatnonzero(casadi.which_depends(move, p, 1)) + 1, default=0))
-    same = casadi.Function("move", [z, p[:used]], [move]).serialize(), steps
+    function = casadi.Function("move", [z, p[:used]], [move], {"cse": True})
+    same = function.serialize(), steps
     if same not in _dynamics_made:
-        made = _RatesStage(z, p, move, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
-        _dynamics_made[same] = made
+        _dynamics_made[same] = _rk4_stage(function, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
     return _dynamics_made[same]
+
+
+def _rk4_stage(rates: casadi.Function, steps: int) -> _Stage:
+    stage = _Stage("dynamics", *rk4.written_out(rates, steps), of_stages=False)
+    found = rk4.in_lanes("dynamics", rates, steps, stage.jacobian_at, stage.hessian_at)
+    interpreted = stage.value, stage.jacobian, stage.hessian
+    stage.value, stage.jacobian, stage.hessian = found or (each.map(LANES) for each in interpreted)
+    return stage
 
 
 class Stages:
@@ -163,21 +123,17 @@ class Stages:
         Args:
             name: what the compiled functions are called, for humans who look into the cache.
             variables: s, w and p.
-            moves: the next state and 0; or rates of the state, and the number of RK4 steps that integrate them over a
-                time of 1.
+            moves: as `dynamics` takes them.
             running: cost, equalities and inequalities.
             final: the same of the end.
             params: length of p without the number of the stage.
             initial_matrix: as in `ocp.Ocp`.
         """
         s, w, p = variables
-        z, (move, steps) = casadi.vertcat(s, w), moves
-        move, costs, final_costs = (
-            casadi.densify(each) for each in (move, casadi.vertcat(*running), casadi.vertcat(*final))
-        )
-        flags = LONG if steps else SIMD
-        self.dynamics = _dynamics(z, p, move, steps)
-        self.running = _Stage(name, z, p, costs, of_stages=True, flags=flags)
+        z = casadi.vertcat(s, w)
+        costs, final_costs = (casadi.densify(casadi.vertcat(*each)) for each in (running, final))
+        self.dynamics = dynamics(z, p, *moves)
+        self.running = _Stage(name, z, p, costs, of_stages=True)
         self.final = _Stage(f"{name}-final", s, p, final_costs, of_stages=False)
         self.equalities, self.final_equalities = running[1].shape[0], final[1].shape[0]
         self.params, self.initial_matrix = params, initial_matrix
@@ -328,6 +284,6 @@ class StagedNlp:
         return self._p_last[: self._final.params]
 
 
-def _nonzeros(matrix: casadi.SX) -> casadi.SX:
+def _nonzeros(matrix: Any) -> Any:
     # CasADi's type stubs do not know that vertcat takes scalar expressions.
     return casadi.vertcat(*matrix.nonzeros()) if matrix.nnz() else casadi.SX(0, 1)  # pyright: ignore[reportCallIssue, reportArgumentType]

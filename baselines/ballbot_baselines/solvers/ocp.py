@@ -47,7 +47,7 @@ class Ocp:
     inputs: int
     params: int
     next: StageFunction
-    """(s, w, p) -> (states,)."""
+    """(s, w, p) -> (states,) the next states; with `rk4_steps` the rates of the states, whose time is 1."""
     cost: StageFunction
     """(s, w, p) -> scalar."""
     equalities: StageFunction = _no_path
@@ -62,9 +62,8 @@ class Ocp:
     """(s, p) -> (mi,), each ≥ 0."""
     counts_stages: bool = False
     """Whether p of every function has one entry more, at its end: the stage's number k, and N at the end."""
-    rates: StageFunction | None = None
-    """(s, w, p) -> (states,) where `next` is `rk4_steps` RK4 steps of these over a time of 1; see `nlp.Stages`."""
-    rk4_steps: int = 1
+    rk4_steps: int = 0
+    """How many RK4 steps integrate the rates; 0 where `next` gives the next states."""
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
 
@@ -73,11 +72,10 @@ class Ocp:
         """The stage functions with their derivatives, made once for solvers of every horizon."""
         params = self.params + self.counts_stages
         s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", self.states), ("w", self.inputs), ("p", params)))
-        moves = (casadi.SX(self.next(s, w, p)), 0) if self.rates is None else (self.rates(s, w, p), self.rk4_steps)
         return Stages(
             self.name,
             (s, w, p),
-            moves,
+            (casadi.SX(self.next(s, w, p)), self.rk4_steps),
             running=(self.cost(s, w, p), self.equalities(s, w, p), self.inequalities(s, w, p)),
             final=(self.final_cost(s, p), self.final_equalities(s, p), self.final_inequalities(s, p)),
             params=self.params,

@@ -107,12 +107,10 @@ def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
         # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
         return casadi.vertcat(margins(s, p), (1 - p[goal]) ** 2 - 1 - casadi.vertcat(*task.goal(x, c)))
 
-    def after(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+    def move(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
         (x, length, _), (robot, limit) = of_stage(s, p), robot_of(p)
-        return casadi.vertcat(robot.step(x, limit * a, length, substeps), s[n:])
-
-    def rates(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        (x, length, _), (robot, limit) = of_stage(s, p), robot_of(p)
+        if kind.robot.DISCRETE:
+            return casadi.vertcat(robot.step(x, limit * a, length, substeps), s[n:])
         return casadi.vertcat(length * robot.derivative(x, limit * a), casadi.SX.zeros(int(free_time)))
 
     def cost(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
@@ -126,12 +124,11 @@ def ocp_of(task: Task, kind: Kind, free_time: bool = False) -> Ocp:
         inputs=len(kind.robot.ACTION),
         params=first + nc + 2 + kind.grips + task.clock,
         counts_stages=task.clock,
-        next=after,
+        next=move,
         cost=cost,
         inequalities=path,
         final_inequalities=final,
-        rates=rates if kind.robot.LONG_EQUATIONS else None,
-        rk4_steps=substeps,
+        rk4_steps=0 if kind.robot.DISCRETE else substeps,
     )
 
 

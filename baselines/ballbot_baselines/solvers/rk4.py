@@ -1,0 +1,105 @@
+"""RK4 steps and their derivatives as machine code, of which only the rates and their derivatives are printed.
+
+Written out, two steps and their derivatives have 28,000 operations, which a compiler needs eight seconds for.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import casadi
+
+from ballbot_baselines.solvers import compiled
+from ballbot_baselines.solvers.compiled import LANES, SIMD
+from ballbot_gym import machine_code
+from ballbot_gym.machine_code import codegen
+
+
+def written_out(rates: casadi.Function, steps: int) -> tuple[casadi.MX, casadi.MX, casadi.MX]:
+    """Symbols z and p, and the state after the steps as an expression of calls of the rates."""
+    states, z, p = rates.size1_out(0), casadi.MX.sym("z", rates.size1_in(0)), casadi.MX.sym("p", rates.size1_in(1))
+    x, held, h = z[:states], z[states:], 1 / steps
+
+    def at(place: casadi.MX) -> casadi.MX:
+        return rates(casadi.vertcat(place, held), p)
+
+    for _ in range(steps):
+        k1 = at(x)
+        k2 = at(x + h / 2 * k1)
+        k3 = at(x + h / 2 * k2)
+        k4 = at(x + h * k3)
+        x += h / 6 * (k1 + 2 * (k2 + k3) + k4)
+    return z, p, x
+
+
+def in_lanes(
+    name: str, rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, hessian_at: casadi.Sparsity
+) -> tuple[casadi.Function, ...] | None:
+    """The steps of `LANES` stages at once, a column each, as machine code; None where they cannot be compiled.
+
+    Args:
+        name: what the library is called, for humans who look into the cache.
+        rates: (z, p) -> the rates of the first entries of z, dense columns; the other entries are held.
+        steps: number of RK4 steps over a time of 1.
+        jacobian_at, hessian_at: where the derivatives of the steps have entries.
+
+    Returns:
+        `value`, `jacobian` and `hessian`, as `nlp.Stage` has them.
+
+    Raises:
+        ValueError: $BALLBOT_CACHE is no absolute path.
+    """
+    library = f"{name}-lanes"
+
+    def source() -> str:
+        # printing takes longer than solving
+        problem = LANES, steps, rates.serialize()
+        return machine_code.printed(library, problem, (), lambda: _source(rates, steps, jacobian_at, hessian_at))
+
+    try:
+        return compiled.loaded(library, source, ("value", "jacobian", "hessian"), SIMD)
+    except NotImplementedError:  # an operation that only CasADi can write as C
+        return None
+
+
+def _source(rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, hessian_at: casadi.Sparsity) -> str:
+    states, width, params = rates.size1_out(0), rates.size1_in(0), rates.size1_in(1)
+    z, p, weights = (casadi.SX.sym(*symbol) for symbol in (("z", width), ("p", params), ("l", states)))
+    rate = rates(z, p)
+    slopes, curves = casadi.jacobian(rate, z), casadi.hessian(casadi.dot(weights, rate), z)[0]
+    moved = casadi.SX.sym("moved", jacobian_at)
+    of_place = casadi.vertcat(moved, casadi.SX.eye(width)[states:, :])
+    changed = casadi.project(casadi.mtimes(slopes, of_place), jacobian_at)
+    upper = casadi.triu(casadi.DM(hessian_at, 1)).sparsity()
+    bent = casadi.project(casadi.triu(of_place.T @ curves @ of_place), upper)
+    back = casadi.densify(slopes[:, :states].T @ weights)
+    at, given = [("at", casadi.vertsplit(z))], [("p", casadi.vertsplit(p))]
+    by_place, by_weights = [("moved", _entries(moved))], [("weights", casadi.vertsplit(weights))]
+    blocks = [
+        codegen.block("rates", [*at, *given], [("rate", _entries(rate))]),
+        codegen.block("change", [*at, *by_place, *given], [("rate", _entries(rate)), ("changed", _entries(changed))]),
+        codegen.block(
+            "bend", [*at, *by_place, *given, *by_weights], [("bent", _entries(bent)), ("back", _entries(back))]
+        ),
+        codegen.block("weigh", [*by_place, *by_weights], [("gradient", _entries(casadi.densify(moved.T @ weights)))]),
+    ]
+    numbers = {(i, j): k for k, (i, j) in enumerate(zip(*upper.get_triplet(), strict=True))}
+    bent_at = [numbers[min(entry), max(entry)] for entry in zip(*hessian_at.get_triplet(), strict=True)]
+    same = [int(i == j) for i, j in zip(*jacobian_at.get_triplet(), strict=True)]
+    sizes = {"STATES": states, "WIDTH": width, "MOVED": len(same), "BENT": len(numbers), "HESSIAN": len(bent_at)}
+    parts = [
+        codegen.header(LANES=LANES, STEPS=steps, **sizes),
+        f"static const real same[] = {{{', '.join(map(str, same))}}};",
+        f"static const int bent_at[] = {{{', '.join(map(str, [*bent_at, 0]))}}};",  # no array of C is empty
+        *blocks,
+        Path(__file__).with_name("rk4.c").read_text(encoding="utf-8"),
+        codegen.external("value", {"z": width, "p": params}, {"next": states}),
+        codegen.external("jacobian", {"z": width, "p": params}, {"next": states, "moved": len(same)}),
+        codegen.external(
+            "hessian", {"z": width, "p": params, "l": states}, {"gradient": width, "entries": len(bent_at)}
+        ),
+    ]
+    return "\n".join(parts)
+
+
+def _entries(part: casadi.SX) -> Sequence[casadi.SX]:
+    return casadi.vertsplit(part.nz[:])
