@@ -83,11 +83,14 @@ def source(task: Task, params: Robot, double: bool) -> str:
     """
     x, c = _symbols("x", params.state_size), _symbols("c", len(task.constant_names))
     z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)
-    action, taken = _symbols("a", params.action_size), _symbols("t", 1)
+    # control steps that were taken, and of a whole episode, so that tasks of all durations share their code
+    action, taken, most = _symbols("a", params.action_size), _symbols("t", 1), _symbols("m", 1)
     now = task.at(c, taken[0] * task.control_dt)
     blocks = [
         block(
-            "advance", (("x", x), ("c", c), ("a", action), ("t", taken)), _advance(task, params, x, c, action, taken[0])
+            "advance",
+            (("x", x), ("c", c), ("a", action), ("t", taken), ("m", most)),
+            _advance(task, params, StepState(x, c, taken[0]), action, most[0]),
         ),
         block(
             "look",
@@ -227,10 +230,10 @@ def text(name: str) -> str:
 
 
 def _advance(
-    task: Task, params: Robot, x: tuple, c: tuple, action: tuple, taken: Any
+    task: Task, params: Robot, state: StepState, action: tuple, most: Any
 ) -> tuple[tuple[str, Sequence[Any]], ...]:
     """One control step, up to the start of the next episode."""
-    did = step(task, params, Randomization(), StepState(x, c, taken), action)
+    did = step(task, params, Randomization(), state, action, most=most)
     end = did.outcome
     return (
         ("end", did.state.x),

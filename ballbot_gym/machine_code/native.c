@@ -12,11 +12,11 @@ __declspec(dllimport) int __stdcall SwitchToThread(void);
 #define YIELD sched_yield
 #endif
 
-/* states, constants, actions and numbers of steps taken -> next states, forces, grip, pay, flags, violated limit */
+/* states, constants, actions, numbers of steps taken and of a whole episode -> next states, forces, grip, pay, flags, violated limit */
 static void advance(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict a, int64_t sa,
-                    const real *restrict t, int64_t st, real *restrict end, int64_t send, real *restrict force, int64_t sforce,
-                    real *restrict grip, int64_t sgrip, real *restrict pay, int64_t spay, real *restrict flags, int64_t sflags,
-                    real *restrict violated, int64_t sviolated);
+                    const real *restrict t, int64_t st, const real *restrict m, int64_t sm, real *restrict end, int64_t send,
+                    real *restrict force, int64_t sforce, real *restrict grip, int64_t sgrip, real *restrict pay, int64_t spay,
+                    real *restrict flags, int64_t sflags, real *restrict violated, int64_t sviolated);
 /* states, constants, numbers of steps taken -> observations, measurements */
 static void look(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict t, int64_t st,
                  real *restrict seen, int64_t sseen, real *restrict measured, int64_t smeasured);
@@ -112,6 +112,7 @@ typedef struct {
     int64_t taken, done; /* robots that threads have taken, and finished */
     int64_t B;
     int64_t most;        /* control steps, after which an episode is truncated */
+    int64_t whole;       /* control steps of an episode of the task */
     int64_t bad;         /* whether an action is not finite */
     int64_t env, component; /* how far apart the actions of robots are, and the components of one, in numbers */
     const real *x, *c, *action;
@@ -152,19 +153,21 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     const int64_t B = m->B;
     const real *const action = m->action + n * m->env;
     real *const end = m->end + n;
-    real taken[LANES] = {0}, after[LANES] = {0}, acts[ACTIONS * LANES] = {0}, paid[PAYS * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
+    real taken[LANES] = {0}, after[LANES] = {0}, whole[LANES], acts[ACTIONS * LANES] = {0}, paid[PAYS * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
     for (int64_t k = 0; k < count; ++k) {
         for (int i = 0; i < ACTIONS; ++i)
             acts[i * LANES + k] = action[k * m->env + i * m->component];
         taken[k] = (real)m->steps[n + k];
         after[k] = taken[k] + 1;
     }
+    for (int k = 0; k < LANES; ++k)
+        whole[k] = (real)m->whole;
     for (int k = 0; k < ACTIONS * LANES; ++k)
         off += acts[k] - acts[k]; /* not a number, unless all are finite */
     if (!(off == 0))
         __atomic_store_n(&m->bad, 1, __ATOMIC_RELAXED);
     if (count == LANES) {
-        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, end, B, end + FORCE * B, B,
+        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, whole, LANES, end, B, end + FORCE * B, B,
                 end + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
         look(end, B, m->c + n, B, after, LANES, end + SIGHT * B, B, end + MEASUREMENTS * B, B);
         write_outcome(m, n, LANES, paid, marks, limit);
@@ -173,7 +176,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
         real *const cs = in + STATES * LANES;
         rows_copy(STATES, count, m->x + n, B, in, LANES);
         rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
-        advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
+        advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, whole, LANES, out, LANES, out + FORCE * LANES, LANES,
                 out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
         look(out, LANES, cs, LANES, after, LANES, out + SIGHT * LANES, LANES, out + MEASUREMENTS * LANES, LANES);
         rows_copy(ROWS, count, out, LANES, end, B);

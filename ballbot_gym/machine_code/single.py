@@ -47,7 +47,10 @@ Numbers = tuple[Any, ...]
 
 
 class StepProblem(NamedTuple):
-    """What the code of a step depends on. Constants, what is drawn, and the robot's numbers are arguments of the code."""
+    """What the code of a step depends on.
+
+    Constants, what is drawn, the robot's numbers, and the number of steps of an episode are arguments of the code.
+    """
 
     task: Task
     kind: Kind
@@ -73,6 +76,7 @@ class StepProblem(NamedTuple):
             "drawn": drawn,
             "robot": robot,
             "model": robot * self.variation.varies_robot,
+            "most": 1,
         }
 
     def of_step(self) -> dict[str, int]:
@@ -117,7 +121,8 @@ class StepProblem(NamedTuple):
             move = closed_form(dt, self.substeps)
         else:
             move = by_engine(given["end"], given["floor"], given["stable"][0], dt)
-        return self._written(robot, step(task, robot, self.variation, state, given["action"], z, move, model), z)
+        did = step(task, robot, self.variation, state, given["action"], z, move, model, given["most"][0])
+        return self._written(robot, did, z)
 
     def started(self, given: Mapping[str, Numbers]) -> dict[str, Numbers]:
         """The same where an episode starts in the state, and nothing was done."""
@@ -232,7 +237,7 @@ class StepCode:
         if robot is not self._nominal:  # which is the same in every episode
             self._nominal, self._numbers = robot, problem.numbers(robot)
         varied = problem.numbers(model) if problem.variation.varies_robot else ()
-        self._fixed[:] = (*c, *drawn, *self._numbers, *varied)
+        self._fixed[:] = (*c, *drawn, *self._numbers, *varied, problem.task.steps)
 
     def step(
         self, state: StepState, action: Numbers, z: Draws, moved: tuple[Numbers, Numbers, float] | None
@@ -309,7 +314,7 @@ def _check(problem: StepProblem, functions: Functions, robot: Robot) -> None:
     own = tuple(problem.numbers(robot))
     for name, compute in [*problem.functions.items()] * _TRIALS:
         given = {name: tuple(rng.uniform(0.05, 0.5, size).tolist()) for name, size in sizes.items()}
-        given |= {name: own for name in ("robot", "model") if sizes[name]}
+        given |= {name: own for name in ("robot", "model") if sizes[name]} | {"most": (float(problem.task.steps),)}
         expected = [float(part) for parts in compute(given).values() for part in parts]
         numbers = np.array([0.0] * count + [part for name in sizes for part in given[name]])
         functions[name](ctypes.c_void_p(numbers.ctypes.data))

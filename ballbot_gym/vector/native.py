@@ -102,7 +102,8 @@ class BallbotNative(BallbotArrays):
         idle = 0 if waiting is None else _pointer(waiting)
         written = _pointers(end, now, seen, c, pay, flags, counts)
         memory = _Memory(
-            0, 0, size, self.most_steps, 0, env // item, component // item, *read, idle, self.restarts, *written
+            *(0, 0, size, self.most_steps, self.task.steps, 0, env // item, component // item),
+            *(*read, idle, self.restarts, *written),
         )
         self._run(memory)
         if memory.bad:  # what was computed is forgotten
@@ -143,7 +144,7 @@ class _Memory(ctypes.Structure):
     """What a step reads and writes; native.c says what each is."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "bad", "env", "component")),
+        *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "whole", "bad", "env", "component")),
         *((name, ctypes.c_void_p) for name in ("x", "c", "action", "steps", "episode", "seed", "idle")),
         ("restarts", ctypes.c_int64),
         *((name, ctypes.c_void_p) for name in ("end", "now", "seen", "new_c", "pay", "flags", "counts")),
