@@ -26,9 +26,9 @@ SIMD = (
 """Flags of the compiler for functions of `LANES` stages."""
 
 LONG = (*SIMD, "-O1", "-fno-ivopts")
-"""The same for more than `_MANY` operations, on which the compiler would spend twice the time."""
+"""The same for a function of more than `_MANY` operations, on which the compiler would spend twice the time."""
 
-_MANY = 8000
+_MANY = 10_000
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
         problem = LANES, *(function.serialize() for function in functions)
         return machine_code.printed(lanes, problem, (), lambda: codegen.in_lanes(functions, LANES))
 
-    flags = LONG if sum(function.n_instructions() for function in functions) > _MANY else SIMD
+    flags = LONG if max(function.n_instructions() for function in functions) > _MANY else SIMD
     try:
         found = loaded(lanes, source, _names(functions), flags)
     except NotImplementedError:  # an operation that only CasADi can write as C
