@@ -20,6 +20,8 @@ typedef struct {
     row moved[MOVED];
 } place; /* where rates are evaluated */
 
+static _Thread_local place places[4 * STEPS]; /* with many steps they would not fit on the stack of a thread */
+
 static const real ahead[4] = {0, 0.5, 0.5, 1}, share[4] = {(real)1 / 6, (real)1 / 3, (real)1 / 3, (real)1 / 6};
 static const real length = (real)1 / STEPS;
 
@@ -51,7 +53,7 @@ static void integrate(const row *z, const row *p, row *next) {
 }
 
 /* The next state, its derivatives, and the places where rates were evaluated on the way. */
-static void differentiate(const row *z, const row *p, row *next, row *moved, place *places) {
+static void differentiate(const row *z, const row *p, row *next, row *moved) {
     row begin[STATES], began[MOVED], rate[STATES] = {{0}}, changed[MOVED] = {{0}};
     copy(STATES, z, next);
     for (int i = 0; i < MOVED; ++i)
@@ -73,7 +75,7 @@ static void differentiate(const row *z, const row *p, row *next, row *moved, pla
 }
 
 /* Backwards, each place adds to the second derivatives by how much its rates count in what is weighted at the end. */
-static void curve(const row *p, const row *weights, const place *places, row *bent) {
+static void curve(const row *p, const row *weights, row *bent) {
     row price[STATES], before[STATES], behind[STATES], counts[STATES], back[STATES], more[BENT + 1];
     copy(STATES, weights, price);
     memset(bent, 0, BENT * sizeof(row));
@@ -99,16 +101,14 @@ static void value_lanes(const real *z, const real *p, real *next) {
 }
 
 static void jacobian_lanes(const real *z, const real *p, real *next, real *moved) {
-    place places[4 * STEPS];
-    differentiate((const row *)z, (const row *)p, (row *)next, (row *)moved, places);
+    differentiate((const row *)z, (const row *)p, (row *)next, (row *)moved);
 }
 
 static void hessian_lanes(const real *z, const real *p, const real *weights, real *gradient, real *entries) {
-    place places[4 * STEPS];
     row next[STATES], moved[MOVED], bent[BENT + 1];
-    differentiate((const row *)z, (const row *)p, next, moved, places);
+    differentiate((const row *)z, (const row *)p, next, moved);
     weigh(moved[0], LANES, weights, LANES, gradient, LANES);
-    curve((const row *)p, (const row *)weights, places, bent);
+    curve((const row *)p, (const row *)weights, bent);
     for (int i = 0; i < HESSIAN; ++i)
         copy(1, bent + bent_at[i], (row *)entries + i);
 }

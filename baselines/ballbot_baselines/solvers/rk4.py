@@ -51,8 +51,8 @@ def in_lanes(
     library = f"{name}-lanes"
 
     def source() -> str:
-        # printing takes longer than solving
-        problem = LANES, steps, rates.serialize()
+        # printing takes longer than solving; files that print are part of what determines the code
+        problem = LANES, steps, rates.serialize(), _text("rk4.py"), _text("rk4.c")
         return machine_code.printed(library, problem, (), lambda: _source(rates, steps, jacobian_at, hessian_at))
 
     try:
@@ -91,7 +91,7 @@ def _source(rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, he
         f"static const real same[] = {{{', '.join(map(str, same))}}};",
         f"static const int bent_at[] = {{{', '.join(map(str, [*bent_at, 0]))}}};",  # no array of C is empty
         *blocks,
-        Path(__file__).with_name("rk4.c").read_text(encoding="utf-8"),
+        _text("rk4.c"),
         codegen.external("value", {"z": width, "p": params}, {"next": states}),
         codegen.external("jacobian", {"z": width, "p": params}, {"next": states, "moved": len(same)}),
         codegen.external(
@@ -99,6 +99,10 @@ def _source(rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, he
         ),
     ]
     return "\n".join(parts)
+
+
+def _text(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _entries(part: casadi.SX) -> Sequence[casadi.SX]:
