@@ -66,6 +66,10 @@ class _Stage:
         self.jacobian_at, self.hessian_at = jacobian.sparsity(), hessian.sparsity()
 
 
+_SHORT = (
+    300  # operations of rates: written out, without calls, steps are interpreted faster, and longer ones take seconds
+)
+
 _dynamics_made: dict[tuple[str, int], _Stage] = {}
 
 
@@ -89,9 +93,13 @@ def dynamics(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
 
 def _rk4_stage(rates: casadi.Function, steps: int) -> _Stage:
     stage = _Stage("dynamics", *rk4.written_out(rates, steps), of_stages=False)
-    found = rk4.in_lanes("dynamics", rates, steps, stage.jacobian_at, stage.hessian_at)
-    interpreted = stage.value, stage.jacobian, stage.hessian
-    stage.value, stage.jacobian, stage.hessian = found or (each.map(LANES) for each in interpreted)
+    functions = rk4.in_lanes("dynamics", rates, steps, stage.jacobian_at, stage.hessian_at)
+    if functions is None:
+        functions = stage.value, stage.jacobian, stage.hessian
+        if rates.n_instructions() < _SHORT:
+            functions = tuple(each.expand(each.name(), {"cse": True}) for each in functions)
+        functions = tuple(each.map(LANES) for each in functions)
+    stage.value, stage.jacobian, stage.hessian = functions
     return stage
 
 
