@@ -4,6 +4,7 @@ The graph is traced from `PolicyNetwork.forward`, so a policy's frame, mirror im
 """
 
 import contextlib
+import copy
 import io
 import logging
 import warnings
@@ -57,9 +58,21 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
     return files.write(path, model.SerializeToString())
 
 
+class _SiLU(torch.nn.Module):
+    """SiLU by the exponential: the sigmoid of onnxruntime has errors that make those of actions a hundred times as large."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x / (1 + torch.exp(-x))
+
+
 def _traced(network: PolicyNetwork) -> Any:
     """The network as an `onnx.ModelProto`, for batches of any size."""
     need("an ONNX file", "onnx", "onnxscript", extra="onnx")
+    network = copy.deepcopy(network)
+    for layers in [each for each in network.modules() if isinstance(each, torch.nn.Sequential)]:
+        for i, layer in enumerate(layers):
+            if isinstance(layer, torch.nn.SiLU):
+                layers[i] = _SiLU()
     example = torch.zeros(2, network.spec.seen)
     silence = logging.getLogger("torch.onnx")
     level, silence.level = silence.level, logging.ERROR  # it lists libraries that are not installed
