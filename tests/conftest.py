@@ -86,7 +86,7 @@ def interpreted(monkeypatch):
     compiled, nlp, shooting = (
         pytest.importorskip(f"ballbot_baselines.solvers.{name}") for name in ("compiled", "nlp", "shooting")
     )
-    monkeypatch.setattr(compiled, "loaded", lambda *_: None)
+    monkeypatch.setattr(compiled, "_loaded", lambda *_: None)
     monkeypatch.setattr(nlp, "_dynamics_made", {})
     for name in ("ocp_of", "_solver"):
         monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))

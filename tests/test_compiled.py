@@ -81,7 +81,7 @@ def test_steps_of_rk4_have_the_derivatives_of_a_robot_s_step(folder, name):
     model, multipliers = kind.model(p[1:]), casadi.SX.sym("l", states)
     x, u = z[:states], z[states:]
     after, rates = casadi.SX(model.step(x, u, p[0], steps)), p[0] * model.derivative(x, u)
-    made = nlp.dynamics(z, p, rates, steps)
+    made = nlp.Stages.motion(z, p, rates, steps)
     hessian, gradient = casadi.hessian(casadi.dot(multipliers, after), z)
     expected = casadi.Function("expected", [z, p, multipliers], [after, casadi.jacobian(after, z), gradient, hessian])
     rng = np.random.default_rng(0)

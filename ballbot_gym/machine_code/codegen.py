@@ -167,12 +167,6 @@ static void scatter(int rows, const real *in, double *columns) {
 """CasADi's matrices have a column per stage, and blocks a row per variable. A null pointer is a 0, or not wanted."""
 
 
-def header(**sizes: int) -> str:
-    """Where C code begins that CasADi loads: numbers by name, one of them LANES, and what `external` calls."""
-    defined = (f"#define {name} {size}" for name, size in {"DOUBLE": 1, **sizes}.items())
-    return "\n".join([*defined, text("real.h"), _CASADI])
-
-
 def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
     """The C code of functions that CasADi loads as external ones: each computes `lanes` stages, a column each, at once.
 
@@ -183,27 +177,39 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
     Raises:
         NotImplementedError: a function has an operation that is not known here.
     """
-    parts = [header(LANES=lanes)]
+    blocks, sizes = [], {}
     for function in functions:
         name = function.name()
         symbols = [casadi.SX.sym(f"in{i}", function.size1_in(i)) for i in range(function.n_in())]
         inputs = [(f"in{i}", casadi.vertsplit(part)) for i, part in enumerate(symbols)]
         outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
-        parts.append(block(f"{name}_lanes", inputs, outputs))
-        sizes = ({pointer: len(rows) for pointer, rows in columns} for columns in (inputs, outputs))
-        parts.append(external(name, *sizes, stride=", LANES"))
-    return "\n".join(parts)
+        blocks.append(block(f"{name}_lanes", inputs, outputs))
+        sizes[name] = tuple({pointer: len(rows) for pointer, rows in columns} for columns in (inputs, outputs))
+    return externals({"LANES": lanes}, blocks, sizes, stride=", LANES")
 
 
-def external(name: str, inputs: Mapping[str, int], outputs: Mapping[str, int], stride: str = "") -> str:
-    """What CasADi looks for in a library to call `NAME_lanes`: the function, and the sizes of what it reads and writes.
+Sizes = Mapping[str, int]
+"""Numbers of rows by the names of pointers."""
+
+
+def externals(
+    defined: Mapping[str, int], parts: Sequence[str], functions: Mapping[str, tuple[Sizes, Sizes]], stride: str = ""
+) -> str:
+    """The C code of a library whose functions CasADi loads as external ones.
 
     Args:
-        name: the function's name.
-        inputs: rows of each pointer that it reads, by name.
-        outputs: rows of each that it writes.
-        stride: what follows a pointer in the call.
+        defined: numbers that the code knows by name, one of them LANES.
+        parts: C code, with `NAME_lanes` of each function.
+        functions: by name, what each reads and what it writes.
+        stride: what follows a pointer in the call of `NAME_lanes`.
     """
+    lines = [f"#define {name} {size}" for name, size in {"DOUBLE": 1, **defined}.items()]
+    entries = [_external(name, *sizes, stride) for name, sizes in functions.items()]
+    return "\n".join([*lines, text("real.h"), _CASADI, *parts, *entries])
+
+
+def _external(name: str, inputs: Sizes, outputs: Sizes, stride: str) -> str:
+    """What CasADi looks for in a library to call `NAME_lanes`: the function, and the sizes of what it reads and writes."""
     body = [f"real {pointer}[{max(rows, 1)} * LANES];" for pointer, rows in (*inputs.items(), *outputs.items())]
     body += [f"gather({rows}, arg[{i}], {pointer});" for i, (pointer, rows) in enumerate(inputs.items())]
     body.append(f"{name}_lanes({', '.join(f'{pointer}{stride}' for pointer in (*inputs, *outputs))});")

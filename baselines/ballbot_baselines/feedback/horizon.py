@@ -12,7 +12,7 @@ import numpy as np
 
 from ballbot_baselines.feedback.disturbance import DisturbanceEstimator
 from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
-from ballbot_baselines.solvers.nlp import dynamics
+from ballbot_baselines.solvers.nlp import Stages
 from ballbot_gym.robot import Kind, Robot
 from ballbot_gym.tasks import Task
 
@@ -247,7 +247,7 @@ def _stage_function(task: Task, kind: Kind) -> casadi.Function:
     (others,) = in_lanes(f"{task.id}-nmpc", (casadi.Function("stage", inputs, outputs, {"cse": True}),))
     # two steps of RK4, as the env takes per control step
     discrete = kind.robot.DISCRETE
-    motion = dynamics(
+    motion = Stages.motion(
         z, p, casadi.SX(robot.step(x, u, h) if discrete else h * robot.derivative(x, u)), 0 if discrete else 2
     )
     given = [casadi.MX.sym(name, others.size_in(i)) for i, name in enumerate(others.name_in())]

@@ -46,7 +46,7 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
     generator = casadi.CodeGenerator("stage.c")
     for function in functions:
         generator.add(function)
-    return loaded(name, generator.dump, _names(functions), ("-O2",)) or functions
+    return _loaded(name, generator.dump, _names(functions), ("-O2",)) or functions
 
 
 def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.Function, ...]:
@@ -66,7 +66,7 @@ def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
 
     flags = LONG if max(function.n_instructions() for function in functions) > _MANY else SIMD
     try:
-        found = loaded(lanes, source, _names(functions), flags)
+        found = _loaded(lanes, source, _names(functions), flags)
     except NotImplementedError:  # an operation that only CasADi can write as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)
@@ -98,7 +98,7 @@ class InPlace:
         return bool(self._buffer.stats()["success"])
 
 
-def loaded(
+def _loaded(
     name: str, source: Callable[[], str], functions: Iterable[str], flags: tuple[str, ...]
 ) -> tuple[casadi.Function, ...] | None:
     """The functions, by their names, of a library of the C code that `source` prints; None where there is none."""

@@ -66,33 +66,13 @@ class _Stage:
         self.jacobian_at, self.hessian_at = jacobian.sparsity(), hessian.sparsity()
 
 
-_SHORT = (
-    300  # operations of rates: written out, without calls, steps are interpreted faster, and longer ones take seconds
-)
+_SHORT = 300  # operations of rates, whose steps are interpreted faster written out; for longer ones that takes seconds
 
 _dynamics_made: dict[tuple[str, int], _Stage] = {}
 
 
-def dynamics(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
-    """The stage of dynamics, shared by problems of the same equations, as those of all tasks of a robot are.
-
-    Args:
-        z: states and inputs.
-        p: parameters.
-        move: the next states; or rates of the states, which RK4 steps integrate over a time of 1.
-        steps: the number of these steps, or 0.
-    """
-    move = casadi.densify(move)
-    used = int(max(np.flatnonzero(casadi.which_depends(move, p, 1)) + 1, default=0))
-    function = casadi.Function("move", [z, p[:used]], [move], {"cse": True})
-    same = function.serialize(), steps
-    if same not in _dynamics_made:
-        _dynamics_made[same] = _rk4_stage(function, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
-    return _dynamics_made[same]
-
-
 def _rk4_stage(rates: casadi.Function, steps: int) -> _Stage:
-    stage = _Stage("dynamics", *rk4.written_out(rates, steps), of_stages=False)
+    stage = _Stage("dynamics", *_written_out(rates, steps), of_stages=False)
     functions = rk4.in_lanes("dynamics", rates, steps, stage.jacobian_at, stage.hessian_at)
     if functions is None:
         functions = stage.value, stage.jacobian, stage.hessian
@@ -101,6 +81,23 @@ def _rk4_stage(rates: casadi.Function, steps: int) -> _Stage:
         functions = tuple(each.map(LANES) for each in functions)
     stage.value, stage.jacobian, stage.hessian = functions
     return stage
+
+
+def _written_out(rates: casadi.Function, steps: int) -> tuple[casadi.MX, casadi.MX, casadi.MX]:
+    """Symbols z and p, and the state after the steps as an expression of calls of the rates."""
+    states, z, p = rates.size1_out(0), casadi.MX.sym("z", rates.size1_in(0)), casadi.MX.sym("p", rates.size1_in(1))
+    x, held, h = z[:states], z[states:], 1 / steps
+
+    def at(place: casadi.MX) -> casadi.MX:
+        return rates(casadi.vertcat(place, held), p)
+
+    for _ in range(steps):
+        k1 = at(x)
+        k2 = at(x + h / 2 * k1)
+        k3 = at(x + h / 2 * k2)
+        k4 = at(x + h * k3)
+        x += h / 6 * (k1 + 2 * (k2 + k3) + k4)
+    return z, p, x
 
 
 class Stages:
@@ -131,7 +128,7 @@ class Stages:
         Args:
             name: what the compiled functions are called, for humans who look into the cache.
             variables: s, w and p.
-            moves: as `dynamics` takes them.
+            moves: as `motion` takes them.
             running: cost, equalities and inequalities.
             final: the same of the end.
             params: length of p without the number of the stage.
@@ -140,11 +137,31 @@ class Stages:
         s, w, p = variables
         z = casadi.vertcat(s, w)
         costs, final_costs = (casadi.densify(casadi.vertcat(*each)) for each in (running, final))
-        self.dynamics = dynamics(z, p, *moves)
+        self.dynamics = self.motion(z, p, *moves)
         self.running = _Stage(name, z, p, costs, of_stages=True)
         self.final = _Stage(f"{name}-final", s, p, final_costs, of_stages=False)
         self.equalities, self.final_equalities = running[1].shape[0], final[1].shape[0]
         self.params, self.initial_matrix = params, initial_matrix
+
+    @staticmethod
+    def motion(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
+        """The stage of dynamics, shared by problems of the same equations, as those of all tasks of a robot are.
+
+        Args:
+            z: states and inputs.
+            p: parameters.
+            move: the next states; or rates of the states, which RK4 steps integrate over a time of 1.
+            steps: the number of these steps, or 0.
+        """
+        move = casadi.densify(move)
+        used = int(max(np.flatnonzero(casadi.which_depends(move, p, 1)) + 1, default=0))
+        function = casadi.Function("move", [z, p[:used]], [move], {"cse": True})
+        same = function.serialize(), steps
+        if same not in _dynamics_made:
+            _dynamics_made[same] = (
+                _rk4_stage(function, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
+            )
+        return _dynamics_made[same]
 
 
 class StagedNlp:

@@ -14,23 +14,6 @@ from ballbot_gym import machine_code
 from ballbot_gym.machine_code import codegen
 
 
-def written_out(rates: casadi.Function, steps: int) -> tuple[casadi.MX, casadi.MX, casadi.MX]:
-    """Symbols z and p, and the state after the steps as an expression of calls of the rates."""
-    states, z, p = rates.size1_out(0), casadi.MX.sym("z", rates.size1_in(0)), casadi.MX.sym("p", rates.size1_in(1))
-    x, held, h = z[:states], z[states:], 1 / steps
-
-    def at(place: casadi.MX) -> casadi.MX:
-        return rates(casadi.vertcat(place, held), p)
-
-    for _ in range(steps):
-        k1 = at(x)
-        k2 = at(x + h / 2 * k1)
-        k3 = at(x + h / 2 * k2)
-        k4 = at(x + h * k3)
-        x += h / 6 * (k1 + 2 * (k2 + k3) + k4)
-    return z, p, x
-
-
 def in_lanes(
     name: str, rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, hessian_at: casadi.Sparsity
 ) -> tuple[casadi.Function, ...] | None:
@@ -56,7 +39,7 @@ def in_lanes(
         return machine_code.printed(library, problem, (), lambda: _source(rates, steps, jacobian_at, hessian_at))
 
     try:
-        return compiled.loaded(library, source, ("value", "jacobian", "hessian"), SIMD)
+        return compiled._loaded(library, source, ("value", "jacobian", "hessian"), SIMD)
     except NotImplementedError:  # an operation that only CasADi can write as C
         return None
 
@@ -87,18 +70,18 @@ def _source(rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, he
     same = [int(i == j) for i, j in zip(*jacobian_at.get_triplet(), strict=True)]
     sizes = {"STATES": states, "WIDTH": width, "MOVED": len(same), "BENT": len(numbers), "HESSIAN": len(bent_at)}
     parts = [
-        codegen.header(LANES=LANES, STEPS=steps, **sizes),
         f"static const real same[] = {{{', '.join(map(str, same))}}};",
         f"static const int bent_at[] = {{{', '.join(map(str, [*bent_at, 0]))}}};",  # no array of C is empty
         *blocks,
         _text("rk4.c"),
-        codegen.external("value", {"z": width, "p": params}, {"next": states}),
-        codegen.external("jacobian", {"z": width, "p": params}, {"next": states, "moved": len(same)}),
-        codegen.external(
-            "hessian", {"z": width, "p": params, "l": states}, {"gradient": width, "entries": len(bent_at)}
-        ),
     ]
-    return "\n".join(parts)
+    read = {"z": width, "p": params}
+    functions = {
+        "value": (read, {"next": states}),
+        "jacobian": (read, {"next": states, "moved": len(same)}),
+        "hessian": (read | {"l": states}, {"gradient": width, "entries": len(bent_at)}),
+    }
+    return codegen.externals({"LANES": LANES, "STEPS": steps, **sizes}, parts, functions)
 
 
 def _text(name: str) -> str:
