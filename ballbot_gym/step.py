@@ -65,7 +65,7 @@ def outcome(
     c: Vector,
     steps: Any,
     grip: tuple[Any, ...] = (),
-    most: Any = None,
+    episode_steps: Any = None,
 ) -> Outcome:
     """What a control step costs, pays and ends.
 
@@ -77,13 +77,13 @@ def outcome(
         c: (nc,) constants of the episode, without the time.
         steps: control steps of the episode, this one included.
         grip: further limits, ≥ 0 where they hold: what keeps a ball's grip.
-        most: control steps of a whole episode; default, the task's.
+        episode_steps: control steps of a whole episode; default, the task's.
     """
-    most = task.steps if most is None else most
+    episode_steps = task.steps if episode_steps is None else episode_steps
     running = task.cost(before, force, task.at(c, (steps - 1) * task.control_dt)) * task.control_dt
     c = task.at(c, steps * task.control_dt)
     violated = first_violated((*task.limits(end, c), *grip), like=end)
-    failure, last = violated >= 0, steps >= most
+    failure, last = violated >= 0, steps >= episode_steps
     reached = ops.full_like(violated, 1.0)
     for excess in task.goal(end, c):
         reached = ops.where(excess <= 0, reached, 0.0)
@@ -92,7 +92,7 @@ def outcome(
         success = ops.where(last, success, 0.0)
     failed = ops.where(failure, ops.full_like(violated, 1.0), 0.0)
     terminated = failed + success if task.first_exit else failed
-    ahead = task.survival_reward * task.control_dt * (most - steps)  # pay for the time that remains
+    ahead = task.survival_reward * task.control_dt * (episode_steps - steps)  # pay for the time that remains
     survive = ops.full_like(violated, task.survival_reward * task.control_dt)
     goal = ops.where(success > 0, ahead, 0.0) if task.first_exit else ops.full_like(violated, 0.0)
     price = ops.where(failure, ahead, 0.0)
@@ -212,7 +212,7 @@ def step(
     z: Draws = Draws(),
     move: Move | None = None,
     model: Any = None,
-    most: Any = None,
+    episode_steps: Any = None,
 ) -> Step:
     """One control step: what the actuators apply, where it takes the robot, and what it costs, pays and ends.
 
@@ -227,13 +227,13 @@ def step(
         z: uniform numbers for a push and for sensors.
         move: how the robot moves; default, the closed form.
         model: the robot of the episode; default, as the variation drew it.
-        most: control steps of a whole episode; default, the task's.
+        episode_steps: control steps of a whole episode; default, the task's.
     """
     if model is None:
         model = variation.robot(robot, state.drawn) if variation.varies_robot else robot
     force, total, actuator = applied(robot, variation, state, action, z.push, task.control_dt)
     end, grip, kept = (move or closed_form(task.control_dt))(model, state.x, total)
-    did = outcome(task, state.x, force, end, state.c, state.steps + 1, kept, most)
+    did = outcome(task, state.x, force, end, state.c, state.steps + 1, kept, episode_steps)
     read = state.sensors
     if read:
         read = Sensors(model, task.control_dt).following(read, state.x, total, end, z.sensors)

@@ -44,9 +44,9 @@ int main(void) {
     for (int n = 0; n < 30; ++n) {
         for (int i = 0; i < ACTIONS * B; ++i)
             action[i] = (real)0.5 * real_sin((real)(n + 0.1 * i));
-        Memory m = {.B = B, .most = 10, .whole = 400, .env = 1, .component = B, .x = x[0], .c = c[0], .action = action,
-                    .steps = steps, .episode = episode[0], .seed = seed, .restarts = 1, .end = end, .now = now, .seen = seen,
-                    .new_c = c[1], .pay = pay, .flags = flags, .counts = counts};
+        Memory m = {.B = B, .most = 10, .episode_steps = 400, .env = 1, .component = B, .x = x[0], .c = c[0],
+                    .action = action, .steps = steps, .episode = episode[0], .seed = seed, .restarts = 1, .end = end,
+                    .now = now, .seen = seen, .new_c = c[1], .pay = pay, .flags = flags, .counts = counts};
         step(&m);
         memcpy(x[0], now, sizeof x[0]);
         memcpy(c[0], c[1], sizeof c[0]);

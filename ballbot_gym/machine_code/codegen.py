@@ -84,13 +84,13 @@ def source(task: Task, params: Robot, double: bool) -> str:
     x, c = _symbols("x", params.state_size), _symbols("c", len(task.constant_names))
     z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)
     # control steps that were taken, and of a whole episode, so that tasks of all durations share their code
-    action, taken, most = _symbols("a", params.action_size), _symbols("t", 1), _symbols("m", 1)
+    action, taken, whole = _symbols("a", params.action_size), _symbols("t", 1), _symbols("w", 1)
     now = task.at(c, taken[0] * task.control_dt)
     blocks = [
         block(
             "advance",
-            (("x", x), ("c", c), ("a", action), ("t", taken), ("m", most)),
-            _advance(task, params, StepState(x, c, taken[0]), action, most[0]),
+            (("x", x), ("c", c), ("a", action), ("t", taken), ("w", whole)),
+            _advance(task, params, StepState(x, c, taken[0]), action, whole[0]),
         ),
         block(
             "look",
@@ -230,16 +230,16 @@ def _external(name: str, inputs: Sizes, outputs: Sizes, stride: str) -> str:
     return "\n".join(parts)
 
 
-def text(name: str) -> str:
-    """The text of a file of C code in the folder of this module."""
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+def text(name: str, module: str = __file__) -> str:
+    """The text of a file of code in the folder of a module, which is given by its `__file__`; default, of this module."""
+    return Path(module).with_name(name).read_text(encoding="utf-8")
 
 
 def _advance(
-    task: Task, params: Robot, state: StepState, action: tuple, most: Any
+    task: Task, params: Robot, state: StepState, action: tuple, episode_steps: Any
 ) -> tuple[tuple[str, Sequence[Any]], ...]:
     """One control step, up to the start of the next episode."""
-    did = step(task, params, Randomization(), state, action, most=most)
+    did = step(task, params, Randomization(), state, action, episode_steps=episode_steps)
     end = did.outcome
     return (
         ("end", did.state.x),

@@ -14,7 +14,7 @@ __declspec(dllimport) int __stdcall SwitchToThread(void);
 
 /* states, constants, actions, numbers of steps taken and of a whole episode -> next states, forces, grip, pay, flags, violated limit */
 static void advance(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict a, int64_t sa,
-                    const real *restrict t, int64_t st, const real *restrict m, int64_t sm, real *restrict end, int64_t send,
+                    const real *restrict t, int64_t st, const real *restrict w, int64_t sw, real *restrict end, int64_t send,
                     real *restrict force, int64_t sforce, real *restrict grip, int64_t sgrip, real *restrict pay, int64_t spay,
                     real *restrict flags, int64_t sflags, real *restrict violated, int64_t sviolated);
 /* states, constants, numbers of steps taken -> observations, measurements */
@@ -112,7 +112,7 @@ typedef struct {
     int64_t taken, done; /* robots that threads have taken, and finished */
     int64_t B;
     int64_t most;        /* control steps, after which an episode is truncated */
-    int64_t whole;       /* control steps of an episode of the task */
+    int64_t episode_steps; /* control steps of an episode of the task */
     int64_t bad;         /* whether an action is not finite */
     int64_t env, component; /* how far apart the actions of robots are, and the components of one, in numbers */
     const real *x, *c, *action;
@@ -161,7 +161,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
         after[k] = taken[k] + 1;
     }
     for (int k = 0; k < LANES; ++k)
-        whole[k] = (real)m->whole;
+        whole[k] = (real)m->episode_steps;
     for (int k = 0; k < ACTIONS * LANES; ++k)
         off += acts[k] - acts[k]; /* not a number, unless all are finite */
     if (!(off == 0))

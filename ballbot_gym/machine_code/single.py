@@ -76,7 +76,7 @@ class StepProblem(NamedTuple):
             "drawn": drawn,
             "robot": robot,
             "model": robot * self.variation.varies_robot,
-            "most": 1,
+            "episode_steps": 1,
         }
 
     def of_step(self) -> dict[str, int]:
@@ -121,7 +121,7 @@ class StepProblem(NamedTuple):
             move = closed_form(dt, self.substeps)
         else:
             move = by_engine(given["end"], given["floor"], given["stable"][0], dt)
-        did = step(task, robot, self.variation, state, given["action"], z, move, model, given["most"][0])
+        did = step(task, robot, self.variation, state, given["action"], z, move, model, given["episode_steps"][0])
         return self._written(robot, did, z)
 
     def started(self, given: Mapping[str, Numbers]) -> dict[str, Numbers]:
@@ -314,7 +314,9 @@ def _check(problem: StepProblem, functions: Functions, robot: Robot) -> None:
     own = tuple(problem.numbers(robot))
     for name, compute in [*problem.functions.items()] * _TRIALS:
         given = {name: tuple(rng.uniform(0.05, 0.5, size).tolist()) for name, size in sizes.items()}
-        given |= {name: own for name in ("robot", "model") if sizes[name]} | {"most": (float(problem.task.steps),)}
+        given |= {name: own for name in ("robot", "model") if sizes[name]} | {
+            "episode_steps": (float(problem.task.steps),)
+        }
         expected = [float(part) for parts in compute(given).values() for part in parts]
         numbers = np.array([0.0] * count + [part for name in sizes for part in given[name]])
         functions[name](ctypes.c_void_p(numbers.ctypes.data))

@@ -284,17 +284,18 @@ class Robot(ABC):
         slope = self.derivative if derivative is None else derivative
         parts, force = ops.components(x), ops.components(u)
         for _ in range(substeps):
-            parts = _rk4(slope, parts, force, dt / substeps)
+            parts = Robot.rk4(slope, parts, force, dt / substeps)
         return ops.stack(parts, like=x)
 
-
-def _rk4(slope: Callable[..., Any], x: tuple, u: tuple, dt: Any) -> tuple:
-    half, sixth = dt / 2, dt / 6
-    k1 = slope(x, u)
-    k2 = slope(_advance(x, half, k1), u)
-    k3 = slope(_advance(x, half, k2), u)
-    k4 = slope(_advance(x, dt, k3), u)
-    return tuple([a + sixth * (b + 2 * (c + d) + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True)])
+    @staticmethod
+    def rk4(slope: Callable[..., tuple[Any, ...]], x: tuple[Any, ...], u: tuple[Any, ...], dt: Any) -> tuple[Any, ...]:
+        """The components of the state one step of RK4 after x, where `slope` gives their rates of x and u."""
+        half, sixth = dt / 2, dt / 6
+        k1 = slope(x, u)
+        k2 = slope(_advance(x, half, k1), u)
+        k3 = slope(_advance(x, half, k2), u)
+        k4 = slope(_advance(x, dt, k3), u)
+        return tuple([a + sixth * (b + 2 * (c + d) + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True)])
 
 
 def _advance(x: tuple, dt: Any, slope: tuple) -> tuple:

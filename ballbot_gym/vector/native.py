@@ -144,7 +144,10 @@ class _Memory(ctypes.Structure):
     """What a step reads and writes; native.c says what each is."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "whole", "bad", "env", "component")),
+        *(
+            (name, ctypes.c_int64)
+            for name in ("taken", "done", "size", "most", "episode_steps", "bad", "env", "component")
+        ),
         *((name, ctypes.c_void_p) for name in ("x", "c", "action", "steps", "episode", "seed", "idle")),
         ("restarts", ctypes.c_int64),
         *((name, ctypes.c_void_p) for name in ("end", "now", "seen", "new_c", "pay", "flags", "counts")),

@@ -16,7 +16,6 @@ import ctypes
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import casadi
@@ -282,7 +281,7 @@ class _Stage:
     def source(self) -> str:
         """The whole C code."""
         defined = [f"#define {name} {value}" for name, value in self.sizes.items()]
-        own = Path(__file__).with_name("ilqr.c").read_text(encoding="utf-8")
+        own = codegen.text("ilqr.c", __file__)
         blocks = [self._sweep(), self._end(), self._hold(), self._bend(), self._steer()]
         return "\n".join([*defined, codegen.text("real.h"), *blocks, own])
 

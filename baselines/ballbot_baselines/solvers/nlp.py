@@ -31,6 +31,7 @@ import numpy as np
 
 from ballbot_baselines.solvers import rk4
 from ballbot_baselines.solvers.compiled import LANES, in_lanes
+from ballbot_gym.robot import Robot
 
 
 class _Stage:
@@ -86,18 +87,14 @@ def _rk4_stage(rates: casadi.Function, steps: int) -> _Stage:
 def _written_out(rates: casadi.Function, steps: int) -> tuple[casadi.MX, casadi.MX, casadi.MX]:
     """Symbols z and p, and the state after the steps as an expression of calls of the rates."""
     states, z, p = rates.size1_out(0), casadi.MX.sym("z", rates.size1_in(0)), casadi.MX.sym("p", rates.size1_in(1))
-    x, held, h = z[:states], z[states:], 1 / steps
+    x, held = (z[:states],), (z[states:],)  # the state is one component, a column
 
-    def at(place: casadi.MX) -> casadi.MX:
-        return rates(casadi.vertcat(place, held), p)
+    def slope(x: tuple[casadi.MX], u: tuple[casadi.MX]) -> tuple[casadi.MX]:
+        return (rates(casadi.vertcat(*x, *u), p),)
 
     for _ in range(steps):
-        k1 = at(x)
-        k2 = at(x + h / 2 * k1)
-        k3 = at(x + h / 2 * k2)
-        k4 = at(x + h * k3)
-        x += h / 6 * (k1 + 2 * (k2 + k3) + k4)
-    return z, p, x
+        x = Robot.rk4(slope, x, held, 1 / steps)
+    return z, p, x[0]
 
 
 class Stages:

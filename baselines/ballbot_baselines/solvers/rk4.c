@@ -7,8 +7,8 @@
    |---|---|---|
    | rates | at, p | the rates of the states at z = at |
    | change | at, moved, p | the same, and ∂rates/∂z where ∂at/∂z = moved |
-   | bend | at, moved, p, weights | BENT entries of Σ_i weights_i ∂²rates_i/∂z², where ∂at/∂z = moved, without the part of its own second
-     derivatives; and Σ_i weights_i ∂rates_i/∂at |
+   | bend | at, moved, p, weights | BENT entries of (∂at/∂z)ᵀ C ∂at/∂z, where C are second derivatives, Σ_i weights_i ∂²rates_i/∂at²; and
+     Σ_i weights_i ∂rates_i/∂at |
    | weigh | moved, weights | Σ_i weights_i moved_i | */
 
 #include <string.h>

@@ -1,10 +1,9 @@
-"""RK4 steps and their derivatives as machine code, of which only the rates and their derivatives are printed.
+"""RK4 steps and their derivatives as machine code: only the rates and their derivatives are printed.
 
 Written out, two steps and their derivatives have 28,000 operations, which a compiler needs eight seconds for.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import casadi
 
@@ -26,7 +25,7 @@ def in_lanes(
         jacobian_at, hessian_at: where the derivatives of the steps have entries.
 
     Returns:
-        `value`, `jacobian` and `hessian`, as `nlp.Stage` has them.
+        `value`, `jacobian` and `hessian`, as a stage of `nlp` has them.
 
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
@@ -35,7 +34,7 @@ def in_lanes(
 
     def source() -> str:
         # printing takes longer than solving; files that print are part of what determines the code
-        problem = LANES, steps, rates.serialize(), _text("rk4.py"), _text("rk4.c")
+        problem = LANES, steps, rates.serialize(), *(codegen.text(name, __file__) for name in ("rk4.py", "rk4.c"))
         return machine_code.printed(library, problem, (), lambda: _source(rates, steps, jacobian_at, hessian_at))
 
     try:
@@ -73,7 +72,7 @@ def _source(rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, he
         f"static const real same[] = {{{', '.join(map(str, same))}}};",
         f"static const int bent_at[] = {{{', '.join(map(str, [*bent_at, 0]))}}};",  # no array of C is empty
         *blocks,
-        _text("rk4.c"),
+        codegen.text("rk4.c", __file__),
     ]
     read = {"z": width, "p": params}
     functions = {
@@ -82,10 +81,6 @@ def _source(rates: casadi.Function, steps: int, jacobian_at: casadi.Sparsity, he
         "hessian": (read | {"l": states}, {"gradient": width, "entries": len(bent_at)}),
     }
     return codegen.externals({"LANES": LANES, "STEPS": steps, **sizes}, parts, functions)
-
-
-def _text(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _entries(part: casadi.SX) -> Sequence[casadi.SX]:
