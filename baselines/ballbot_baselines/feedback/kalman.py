@@ -23,7 +23,8 @@ import casadi
 import gymnasium
 import numpy as np
 
-from ballbot_baselines.solvers.compiled import LANES, InPlace, in_lanes
+from ballbot_baselines.solvers.compiled import LANES, InPlace
+from ballbot_baselines.solvers.stage import Stage
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robot import ROBOT_FACTORS, Randomization, Robot, Sensors
 from ballbot_gym.step import observation_space
@@ -69,10 +70,11 @@ class TrackFilter:
         one_for_each = (*x.shape[:-1], len(self._delays))
         calls = -(-int(np.prod(one_for_each)) // LANES)
         count = calls * LANES
-        self._before, self._held = np.zeros((count, _SIZE)), np.zeros((count, 2))
-        self._after, self._slopes = np.zeros((count, 8)), np.zeros((count, _SIZE, 8))
-        step = _step_function(self._params, self._dt).map(calls)
-        self._step = InPlace(step, [self._before, self._held], [self._after, self._slopes])
+        steps = _control_steps(self._params, self._dt)
+        self._before, self._held = np.zeros((count, steps.width)), np.zeros((count, 2))
+        self._after, self._slopes = np.zeros((count, 8)), np.zeros((count, steps.jacobian_at.nnz()))
+        self._slopes_at = steps.jacobian_at.get_triplet()
+        self._step = InPlace(steps.jacobian.map(calls), [self._before, self._held], [self._after, self._slopes])
         middle = np.concatenate([np.zeros(8), (self._low + self._high) / 2, np.zeros(6)])
         self._z, self._p = np.tile(middle, (*one_for_each, 1)), np.tile(np.diag(self._prior), (*one_for_each, 1, 1))
         self._z[..., _X] = x[..., None, :]
@@ -86,9 +88,12 @@ class TrackFilter:
         self._commands = [np.asarray(u, np.float64), *self._commands[:-1]]
         forces = np.stack([self._commands[delay] for delay in self._delays], -2)
         count = self._likelihood.size
-        self._before[:count], self._held[:count] = self._z.reshape(-1, _SIZE), forces.reshape(-1, 2)
+        self._before[:count] = self._z[..., : _FACTORS.stop].reshape(count, -1)
+        self._held[:count] = forces.reshape(-1, 2)
         self._step()
-        slopes = self._slopes[:count].swapaxes(-1, -2).reshape(*forces.shape[:-1], 8, _SIZE)
+        slopes = np.zeros((*forces.shape[:-1], 8, _SIZE))
+        rows, columns = self._slopes_at
+        slopes[..., rows, columns] = self._slopes[:count].reshape(*forces.shape[:-1], -1)
         # Factors multiply each other: what they move x by is wrong by about the share that they are uncertain by.
         of_factors, moved = self._p[..., _FACTORS, _FACTORS], slopes[..., _FACTORS]
         share = np.trace(of_factors, axis1=-2, axis2=-1)[..., None]
@@ -157,16 +162,13 @@ class TrackFilter:
 
 
 @lru_cache(maxsize=16)
-def _step_function(params: Robot, dt: float) -> casadi.Function:
-    """(z, commanded force) -> x after a control step of dt, s, in which the force acts, and its Jacobian (8, 17) as a column;
-    of `LANES` filters at once.
-    """
-    z, u = casadi.SX.sym("z", _SIZE), casadi.SX.sym("u", 2)
-    mass, height, force = (z[8 + i] for i in range(3))
+def _control_steps(params: Robot, dt: float) -> Stage:
+    """The state x after a control step of dt, s, of z = (x, factors) and the commanded force p."""
+    z, force = casadi.SX.sym("z", _FACTORS.stop), casadi.SX.sym("u", 2)
+    mass, height, share = casadi.vertsplit(z[_FACTORS])
     robot = Randomization().robot(params, (mass, 1.0, height, 1.0))
-    x = robot.step(z[_X], force * u, dt, robot.substeps(dt))
-    slopes = casadi.vec(casadi.densify(casadi.jacobian(x, z)))
-    return in_lanes("filter", (casadi.Function("step", [z, u], [x, slopes], {"cse": True}),))[0]
+    rates = casadi.densify(dt * casadi.SX(robot.derivative(z[_X], share * force)))
+    return Stage.of_steps("filter", casadi.Function("rates", [z, force], [rates], {"cse": True}), robot.substeps(dt), 1)
 
 
 def _corrected(

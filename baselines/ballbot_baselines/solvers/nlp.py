@@ -3,7 +3,7 @@
     minimize    f(z) = Σ_{k<N} cost(s_k, w_k, p) + final_cost(s_N, p)
     subject to  g(z) = 0 or ≥ 0
 
-Everything is a map of stage functions over the stages. `_Stage` differentiates the functions of one stage, and `StagedNlp`
+Everything is a map of stage functions over the stages. `Stage` differentiates the functions of one stage, and `StagedNlp`
 puts the nonzeros of all stages in their places.
 
 Variables z:
@@ -24,77 +24,14 @@ Constraints g, in the order that fatrop needs:
 """
 
 import itertools
-from typing import Any
 
 import casadi
 import numpy as np
 
-from ballbot_baselines.solvers import rk4
-from ballbot_baselines.solvers.compiled import LANES, in_lanes
-from ballbot_gym.robot import Robot
+from ballbot_baselines.solvers.compiled import LANES
+from ballbot_baselines.solvers.stage import Stage
 
-
-class _Stage:
-    """A vector function out(z, p) of one stage, with the nonzeros of its Jacobian and of its Lagrangian's Hessian.
-
-    A function takes the parameters up to the last one that it depends on. So problems that differ only in the others share
-    their compiled dynamics. With `of_stages` the functions are compiled, and compute `LANES` stages at once, a column each.
-
-    | attribute | meaning |
-    |---|---|
-    | `value` | (z, p) -> out |
-    | `jacobian` | (z, p) -> out, nonzeros of ∂out/∂z in the order of `jacobian_at` |
-    | `hessian` | (z, p, l) -> gradient of lᵀout, nonzeros of its Hessian in the order of `hessian_at` |
-    | `jacobian_at`, `hessian_at` | sparsity patterns |
-    | `size`, `width`, `params` | lengths of out, of z, and of the p that is taken |
-    """
-
-    def __init__(self, name: str, z: Any, p: Any, out: Any, of_stages: bool):
-        """Args: z, p, out: symbols and an expression, of CasADi's SX, or MX where stages are not compiled."""
-        used = max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0)
-        p = p[:used] if used else type(p).sym("p", 0)
-        multipliers = type(out).sym("l", out.shape[0])
-        jacobian = casadi.jacobian(out, z)
-        hessian, gradient = casadi.hessian(casadi.dot(multipliers, out), z)
-        options = {"cse": True}
-        functions = (
-            casadi.Function("value", [z, p], [out], options),
-            casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
-            casadi.Function("hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options),
-        )
-        self.value, self.jacobian, self.hessian = in_lanes(name, functions) if of_stages else functions
-        self.size, self.width, self.params = out.shape[0], z.shape[0], p.shape[0]
-        self.jacobian_at, self.hessian_at = jacobian.sparsity(), hessian.sparsity()
-
-
-_SHORT = 300  # operations of rates, whose steps are interpreted faster written out; for longer ones that takes seconds
-
-_dynamics_made: dict[tuple[str, int], _Stage] = {}
-
-
-def _rk4_stage(rates: casadi.Function, steps: int) -> _Stage:
-    stage = _Stage("dynamics", *_written_out(rates, steps), of_stages=False)
-    functions = rk4.in_lanes("dynamics", rates, steps, stage.jacobian_at, stage.hessian_at)
-    if functions is None:
-        functions = stage.value, stage.jacobian, stage.hessian
-        if rates.n_instructions() < _SHORT:
-            functions = tuple(each.expand(each.name(), {"cse": True}) for each in functions)
-        functions = tuple(each.map(LANES) for each in functions)
-    stage.value, stage.jacobian, stage.hessian = functions
-    return stage
-
-
-def _written_out(rates: casadi.Function, steps: int) -> tuple[casadi.MX, casadi.MX, casadi.MX]:
-    """Symbols z and p, and the state after the steps as an expression of calls of the rates."""
-    states, z, p = rates.size1_out(0), casadi.MX.sym("z", rates.size1_in(0)), casadi.MX.sym("p", rates.size1_in(1))
-    x, held = (z[:states],), (z[states:],)  # the state is one component, a column
-
-    def slope(x: tuple[casadi.MX], u: tuple[casadi.MX]) -> tuple[casadi.MX]:
-        return (rates(casadi.vertcat(*x, *u), p),)
-
-    for _ in range(steps):
-        x = Robot.rk4(slope, x, held, 1 / steps)
-    return z, p, x[0]
+_dynamics_made: dict[tuple[str, int], Stage] = {}
 
 
 class Stages:
@@ -135,13 +72,13 @@ class Stages:
         z = casadi.vertcat(s, w)
         costs, final_costs = (casadi.densify(casadi.vertcat(*each)) for each in (running, final))
         self.dynamics = self.motion(z, p, *moves)
-        self.running = _Stage(name, z, p, costs, of_stages=True)
-        self.final = _Stage(f"{name}-final", s, p, final_costs, of_stages=False)
+        self.running = Stage(name, z, p, costs, of_stages=True)
+        self.final = Stage(f"{name}-final", s, p, final_costs, of_stages=False)
         self.equalities, self.final_equalities = running[1].shape[0], final[1].shape[0]
         self.params, self.initial_matrix = params, initial_matrix
 
     @staticmethod
-    def motion(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> _Stage:
+    def motion(z: casadi.SX, p: casadi.SX, move: casadi.SX, steps: int) -> Stage:
         """The stage of dynamics, shared by problems of the same equations, as those of all tasks of a robot are.
 
         Args:
@@ -156,7 +93,7 @@ class Stages:
         same = function.serialize(), steps
         if same not in _dynamics_made:
             _dynamics_made[same] = (
-                _rk4_stage(function, steps) if steps else _Stage("dynamics", z, p, move, of_stages=True)
+                Stage.of_steps("dynamics", function, steps) if steps else Stage("dynamics", z, p, move, of_stages=True)
             )
         return _dynamics_made[same]
 
@@ -292,7 +229,7 @@ class StagedNlp:
             casadi.diagcat(sum(of_stages), casadi.MX(self._final.hessian_at, final_hessian)),
         )
 
-    def _over_stages(self, stage: _Stage, function: casadi.Function, *multipliers: casadi.MX) -> list[casadi.MX]:
+    def _over_stages(self, stage: Stage, function: casadi.Function, *multipliers: casadi.MX) -> list[casadi.MX]:
         """Results of all stages, a column each. The last block of stages is filled up with the last stage."""
         blocks = -(-self._n // LANES)
         last = [self._n - 1] * (blocks * LANES - self._n)
@@ -304,8 +241,3 @@ class StagedNlp:
     @property
     def _p_of_end(self) -> casadi.MX:
         return self._p_last[: self._final.params]
-
-
-def _nonzeros(matrix: Any) -> Any:
-    # CasADi's type stubs do not know that vertcat takes scalar expressions.
-    return casadi.vertcat(*matrix.nonzeros()) if matrix.nnz() else casadi.SX(0, 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
