@@ -4,7 +4,7 @@ Of RK4 steps, only the rates and their derivatives are printed as C, and loops a
 and their derivatives have 28,000 operations, which a compiler needs eight seconds for.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import casadi
@@ -17,7 +17,6 @@ from ballbot_gym.machine_code import codegen
 from ballbot_gym.robot import Robot
 
 _SHORT = 300  # operations of rates, whose steps are interpreted faster written out; for longer ones that takes seconds
-_CODE = ("rk4.c", "rk4_jacobian.c", "rk4_hessian.c")
 
 
 class Stage:
@@ -42,16 +41,16 @@ class Stage:
             name: what the compiled functions are called, for humans who look into the cache.
             z, p, out: symbols and an expression, of CasADi's SX, or MX where stages are not compiled.
             of_stages: see above.
-            order: of the highest derivatives that are called: with 1 there is no `hessian`, and with 0 no `jacobian` either.
+            order: of the derivatives that are called; with 1 there is no `hessian`.
         """
         used = max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0)
         p = p[:used] if used else type(p).sym("p", 0)
-        options, self._patterns = {"cse": True}, []
-        functions = [casadi.Function("value", [z, p], [out], options)]
-        if order > 0:
-            jacobian = casadi.jacobian(out, z)
-            self._patterns.append(jacobian.sparsity())
-            functions.append(casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options))
+        options, jacobian = {"cse": True}, casadi.jacobian(out, z)
+        functions = [
+            casadi.Function("value", [z, p], [out], options),
+            casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
+        ]
+        self._patterns = [jacobian.sparsity()]
         if order > 1:
             multipliers = type(out).sym("l", out.shape[0])
             hessian, gradient = casadi.hessian(casadi.dot(multipliers, out), z)
@@ -121,13 +120,13 @@ def _steps_in_lanes(
 ) -> tuple[casadi.Function, ...] | None:
     """The functions of RK4 steps as machine code; None where they cannot be compiled.
 
-    `patterns` are those of the derivatives that are wanted: of none, the first, or the first and second.
+    `patterns` are those of the derivatives that are wanted.
     """
     library = f"{name}-lanes"
 
     def source() -> str:
         # printing takes longer than solving; files that print are part of what determines the code
-        files = (codegen.text(name, __file__) for name in ("stage.py", *_CODE))
+        files = (codegen.text(name, __file__) for name in ("stage.py", "rk4.c"))
         problem = LANES, steps, len(patterns), rates.serialize(), *files
         return machine_code.printed(library, problem, (), lambda: _steps_source(rates, steps, patterns))
 
@@ -140,49 +139,38 @@ def _steps_in_lanes(
 def _steps_source(rates: casadi.Function, steps: int, patterns: Sequence[casadi.Sparsity]) -> str:
     states, width, params = rates.size1_out(0), rates.size1_in(0), rates.size1_in(1)
     z, p, weights = (casadi.SX.sym(*symbol) for symbol in (("z", width), ("p", params), ("l", states)))
-    rate = rates(z, p)
-    at, given = [("at", casadi.vertsplit(z))], [("p", casadi.vertsplit(p))]
-    sizes = {"LANES": LANES, "STEPS": steps, "STATES": states, "WIDTH": width}
+    rate, moved = rates(z, p), casadi.SX.sym("moved", patterns[0])
+    slopes, of_place = casadi.jacobian(rate, z), casadi.vertcat(moved, casadi.SX.eye(width)[states:, :])
+    changed = casadi.project(slopes @ of_place, patterns[0])
+    same = [int(i == j) for i, j in zip(*patterns[0].get_triplet(), strict=True)]
+    parts = [
+        _block("rates", [("at", z), ("p", p)], [("rate", rate)]),
+        _block("change", [("at", z), ("moved", moved), ("p", p)], [("rate", rate), ("changed", changed)]),
+        f"static const real same[] = {{{', '.join(map(str, same))}}};",
+    ]
+    sizes = {"LANES": LANES, "STEPS": steps, "STATES": states, "WIDTH": width, "MOVED": len(same)}
     read = {"z": width, "p": params}
-    functions = {"value": (read, {"next": states})}
-    parts = [codegen.block("rates", [*at, *given], [("rate", _entries(rate))])]
-    if patterns:
-        jacobian_at = patterns[0]
-        moved, slopes = casadi.SX.sym("moved", jacobian_at), casadi.jacobian(rate, z)
-        of_place = casadi.vertcat(moved, casadi.SX.eye(width)[states:, :])
-        changed = casadi.project(casadi.mtimes(slopes, of_place), jacobian_at)
-        by_place = [("moved", _entries(moved))]
-        made = [("rate", _entries(rate)), ("changed", _entries(changed))]
-        same = [int(i == j) for i, j in zip(*jacobian_at.get_triplet(), strict=True)]
-        parts += [
-            codegen.block("change", [*at, *by_place, *given], made),
-            f"static const real same[] = {{{', '.join(map(str, same))}}};",
-        ]
-        sizes["MOVED"] = len(same)
-        functions["jacobian"] = (read, {"next": states, "moved": len(same)})
+    functions = {"value": (read, {"next": states}), "jacobian": (read, {"next": states, "moved": len(same)})}
     if len(patterns) > 1:
-        hessian_at, by_weights = patterns[1], [("weights", casadi.vertsplit(weights))]
-        upper = casadi.triu(casadi.DM(hessian_at, 1)).sparsity()
-        curves = casadi.hessian(casadi.dot(weights, rate), z)[0]
-        bent = casadi.project(casadi.triu(of_place.T @ curves @ of_place), upper)
-        back = casadi.densify(slopes[:, :states].T @ weights)
-        made = [("bent", _entries(bent)), ("back", _entries(back))]
-        gradient = [("gradient", _entries(casadi.densify(moved.T @ weights)))]
+        upper = casadi.triu(casadi.DM(patterns[1], 1)).sparsity()
+        bent = casadi.triu(of_place.T @ casadi.hessian(casadi.dot(weights, rate), z)[0] @ of_place)
+        back, gradient = slopes[:, :states].T @ weights, moved.T @ weights
+        given = [("at", z), ("moved", moved), ("p", p), ("weights", weights)]
         numbers = {(i, j): k for k, (i, j) in enumerate(zip(*upper.get_triplet(), strict=True))}
-        bent_at = [numbers[min(entry), max(entry)] for entry in zip(*hessian_at.get_triplet(), strict=True)]
+        bent_at = [numbers[min(entry), max(entry)] for entry in zip(*patterns[1].get_triplet(), strict=True)]
         parts += [
-            codegen.block("bend", [*at, *by_place, *given, *by_weights], made),
-            codegen.block("weigh", [*by_place, *by_weights], gradient),
+            _block("bend", given, [("bent", casadi.project(bent, upper)), ("back", casadi.densify(back))]),
+            _block("weigh", [given[1], given[3]], [("gradient", casadi.densify(gradient))]),
             f"static const int bent_at[] = {{{', '.join(map(str, [*bent_at, 0]))}}};",  # no array of C is empty
         ]
         sizes |= {"BENT": len(numbers), "HESSIAN": len(bent_at)}
         functions["hessian"] = (read | {"l": states}, {"gradient": width, "entries": len(bent_at)})
-    code = [codegen.text(name, __file__) for name in _CODE[: len(functions)]]
-    return codegen.externals(sizes, [*parts, *code], functions)
+    return codegen.externals(sizes, [*parts, codegen.text("rk4.c", __file__)], functions)
 
 
-def _entries(part: casadi.SX) -> Sequence[casadi.SX]:
-    return casadi.vertsplit(part.nz[:])
+def _block(name: str, *sides: Iterable[tuple[str, casadi.SX]]) -> str:
+    inputs, outputs = ([(pointer, casadi.vertsplit(part.nz[:])) for pointer, part in side] for side in sides)
+    return codegen.block(name, inputs, outputs)
 
 
 def _nonzeros(matrix: Any) -> Any:
