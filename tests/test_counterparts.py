@@ -101,11 +101,15 @@ def test_stable_baselines_monitors_evaluates_and_logs_the_gap(tmp_path):
 def test_a_model_its_file_and_its_function_have_the_same_regret(kind, options, tmp_path):
     model = kind("MlpPolicy", gymnasium.make("Pendulum-v1"), seed=1, **options)
     model.save(tmp_path / "model.zip")
-    function = lambda observation: model.predict(observation, deterministic=True)[0]  # noqa: E731
+
+    def function(observation):
+        return model.predict(observation, deterministic=True)[0]
+
     rows = [evaluate(policy, "Pendulum-v1", 2) for policy in (model, tmp_path / "model.zip", function)]
     costs = [row.cost_mean for row in rows]
     assert costs == pytest.approx([costs[0]] * 3, rel=1e-4)
     assert rows[0].episodes == 2
+    assert [row.controller for row in (rows[0], rows[2])] == [kind.__name__.lower(), "function"]
     with gymnasium.make("Pendulum-v1") as env:
         total = 0.0
         for seed in range(2):

@@ -109,8 +109,9 @@ def evaluate(
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = range(checked_episodes(episodes))
-        policy = counterparts.translated(policy, task, env.task, env.params)
-        controller = as_controller(policy, env.task, env.params, filter)
+        acting = counterparts.translated(policy, task, env.task, env.params)
+        controller = as_controller(acting, env.task, env.params, filter)
+        policy = acting if isinstance(policy, str | Path) else policy  # others keep their own name
         env = _showing(env, controller)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         written = ControllerName(str(policy)) if isinstance(policy, str | Path) else None
