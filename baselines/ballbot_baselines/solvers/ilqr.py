@@ -242,13 +242,13 @@ ilqr = functools.lru_cache(maxsize=8)(_Ilqr)
 @functools.cache
 def _compiled(task: Task, kind: Kind, free_time: bool, rests: bool) -> tuple[ctypes.CDLL, dict[str, int]]:
     """The functions of ilqr.c for a task and a kind of robot, and the sizes that they were made for."""
-    stage = _Stage(task, kind, free_time, rests)
+    code = _Code(task, kind, free_time, rests)
     # no name of a task, so that tasks with the same code share its library
     name = "ilqr-free" if free_time else "ilqr"
-    return ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.sizes
+    return ctypes.CDLL(str(machine_code.library(name, code.source(), SIMD))), code.sizes
 
 
-class _Stage:
+class _Code:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
     def __init__(self, task: Task, kind: Kind, free_time: bool, rests: bool):

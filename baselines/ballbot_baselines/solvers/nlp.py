@@ -88,8 +88,7 @@ class Stages:
             steps: the number of these steps, or 0.
         """
         move = casadi.densify(move)
-        used = int(max(np.flatnonzero(casadi.which_depends(move, p, 1)) + 1, default=0))
-        function = casadi.Function("move", [z, p[:used]], [move], {"cse": True})
+        function = casadi.Function("move", [z, Stage.taken(p, move)], [move], {"cse": True})
         same = function.serialize(), steps
         if same not in _dynamics_made:
             _dynamics_made[same] = (

@@ -43,8 +43,7 @@ class Stage:
             of_stages: see above.
             order: of the derivatives that are called; with 1 there is no `hessian`.
         """
-        used = max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0)
-        p = p[:used] if used else type(p).sym("p", 0)
+        p = self.taken(p, out)
         options, jacobian = {"cse": True}, casadi.jacobian(out, z)
         functions = [
             casadi.Function("value", [z, p], [out], options),
@@ -80,6 +79,12 @@ class Stage:
             functions = tuple(each.map(LANES) for each in functions)
         stage._functions = functions
         return stage
+
+    @staticmethod
+    def taken(p: Any, out: Any) -> Any:
+        """The parameters p up to the last one that out depends on."""
+        used = int(max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0))
+        return p[:used] if used else type(p).sym("p", 0)
 
     @property
     def value(self) -> casadi.Function:
